@@ -1,0 +1,70 @@
+// solver/kernels/kernels.h - shading in float32: many lights, one surface point, as fast as the machine goes.
+//
+// One table of functions per instruction set; kernels_select() picks the best the CPU has. All variants give the same answer
+// to the bound in tests/check_kernels.c, relative to the light that could arrive (sum of V_i c_i), not to the result.
+// Kernels do not allocate, do no I/O, keep no state; arrays are 64-byte aligned and padded to KERNEL_WIDTH with zero irradiance.
+#pragma once
+#include "solver/disney.h"
+#include "solver/lights.h"
+#include <stdbool.h>
+#include <stdint.h>
+
+enum { KERNEL_WIDTH = 16 };
+
+// Lights as the kernels like them: l_d = R dh, q = 1/r, C; one array each, n_padded long (a multiple of KERNEL_WIDTH).
+struct light_arrays {
+    int n, n_padded;
+    float centre_m[3];
+    float *dx, *dy, *dz, *q, *cr, *cg, *cb;
+};
+int light_arrays_new(struct light_arrays *out, const struct lights *lights); // 0 or -ENOMEM
+void light_arrays_update(struct light_arrays *a, const struct lights *lights); // same n; after c, R or r moved
+void light_arrays_free(struct light_arrays *a);
+
+struct surface_point {
+    float position_m[3], normal[3], tangent[3], bitangent[3];
+};
+
+// What of the lights is left for one surface point: above the horizon, visible, compacted; shared by all its views.
+// wr,wg,wb = V_i max(<n,l_i>,0) c_i(p) per channel.
+struct lit {
+    int n, capacity;
+    float *lx, *ly, *lz, *nl, *sl /* S(nl) = (1-nl)^5 */, *wr, *wg, *wb;
+};
+int lit_new(struct lit *out, int n_lights); // 0 or -ENOMEM
+void lit_free(struct lit *l);
+
+struct shade_material {
+    float theta[DISNEY_N], albedo[3];
+    enum disney_variant variant;
+};
+struct shade_jacobian {      // of outgoing radiance L (3 channels)
+    float L[3];
+    float theta[3][DISNEY_N];
+    float albedo[3][3];      // [channel of L][channel of albedo]
+};
+
+struct kernels {
+    const char *name; // "reference", "portable", "avx2", "avx512"
+    // Gather: Eqs. 1-4 for every light, horizon, visibility. visible: one bit per light (NULL: all); soft: one byte per light
+    // (x/255; NULL: 1).
+    void (*gather)(struct lit *out, const struct light_arrays *lights, const struct surface_point *s,
+                   const uint16_t *visible, const uint8_t *soft);
+    // Eq. 5 from the gathered lights. v: unit, to the camera. L = 0 when <n,v> <= 0.
+    void (*shade)(float L[3], const struct lit *lit, const struct surface_point *s, const float v[3],
+                  const struct shade_material *m);
+    void (*shade_jacobian)(struct shade_jacobian *out, const struct lit *lit, const struct surface_point *s,
+                           const float v[3], const struct shade_material *m);
+    // gather + shade_jacobian in one loop without sharing or compaction: the yardstick "brute force".
+    void (*brute_jacobian)(struct shade_jacobian *out, const struct light_arrays *lights,
+                           const struct surface_point *s, const float v[3], const struct shade_material *m);
+    // Lambert: irradiance E = sum V_i <n,l_i> c_i, without albedo / pi, in one pass over the lights.
+    void (*irradiance)(float E[3], const struct light_arrays *lights, const struct surface_point *s,
+                       const uint16_t *visible);
+};
+
+enum { KERNELS_REFERENCE = 1, KERNELS_PORTABLE = 2, KERNELS_AVX2 = 4, KERNELS_AVX512 = 8, KERNELS_ALL = 15 };
+// The fastest of the allowed variants that this CPU and this build have; the reference if none.
+// The environment's RIGSOLVE_KERNEL=reference|portable|avx2|avx512 narrows `allow` further (a name the CPU lacks: warned, ignored).
+const struct kernels *kernels_select(unsigned allow);
+const struct kernels *kernels_by_name(const char *name); // NULL: unknown, or not on this CPU

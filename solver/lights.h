@@ -1,0 +1,56 @@
+// solver/lights.h - from a panorama to N lights, and from lights to irradiance anywhere (paper, Eqs. 1-4).
+//
+// A light is what one region of the panorama sends: probe direction dh_i, irradiance C_i on a surface facing it at the
+// probe's place. Where it is in the world is the set-up: centre c, rotation R (world_from_probe) and 1/r_i.
+#pragma once
+#include "solver/panorama.h"
+#include "solver/take/json.h"
+
+struct light_region { // panorama pixels [x0,x1) x [y0,y1)
+    int x0, y0, x1, y1;
+};
+
+struct lights {
+    int n;
+    double (*dir_probe)[3];  // [n] unit
+    double (*irradiance)[3]; // [n] C_i, RGB
+    struct light_region *region; // [n], or NULL (lights that did not come from a panorama)
+    double *spread_rad;      // [n] energy-weighted RMS angle of the region's pixels about dir_probe; or NULL
+    int panorama_width_px, panorama_height_px; // 0 without a panorama
+    // The set-up:
+    double centre_m[3];         // c
+    double world_from_probe[9]; // R
+    double *inverse_distance;   // [n] 1/r_i in 1/m; 0 = directional
+    int32_t *group;             // [n] emitter, -1: none
+};
+
+// Zeroed set-up: c = 0, R = identity, all directional, no group. 0 or -ENOMEM.
+int lights_new(struct lights *out, int n);
+void lights_free(struct lights *l); // leaves it zeroed
+
+// Median cut (Debevec 2005): n = 2^k regions, 1 <= n <= 65536, that partition the panorama; each is split along its longer side
+// (width x cos(elevation of its centre)) where the luminance x solid angle halves. A region that cannot be split (one pixel, or
+// no energy) gives an empty light (irradiance 0). Total energy is kept. 0, -EINVAL (n), -ENOMEM.
+int lights_median_cut(struct lights *out, const struct panorama *p, int n);
+
+// lights.json (FORMAT: DESIGN.md 6): {format, panorama:{width,height}, centre_m, world_from_probe, lights:[{dir_probe, irradiance,
+// distance_m (null = directional), pos_m, group, region}]}. Reading checks ranges; errors are logged, -EINVAL.
+int lights_write_json(const struct lights *l, const char *path);
+int lights_read_json(struct lights *out, const char *path);
+
+// Irradiance that light i gives a surface at p facing it, and where it comes from (Eqs. 1-4), written so that q = 1/r = 0 is
+// an ordinary value: u = R dh + q (c - p);  l = u/|u|;  c_i(p) = max(<u, R dh>, 0) / |u|^3 C_i.
+struct light_at {
+    double l[3];   // unit direction to the light
+    double weight; // c_i(p) = weight * C_i
+};
+struct light_at_gradient {
+    struct light_at at;
+    double l_centre[9], weight_centre[3];     // d l / d c (3x3), d weight / d c
+    double l_rotation[9], weight_rotation[3]; // by w, R = exp([w]x) R0, at w = 0
+    double l_inverse_distance[3], weight_inverse_distance;
+    double l_point[9], weight_point[3];       // by p
+};
+void light_at_point(const struct lights *l, int i, const double point_m[3], struct light_at *out);
+void light_at_point_gradient(const struct lights *l, int i, const double point_m[3],
+                             struct light_at_gradient *out);

@@ -1,0 +1,40 @@
+// solver/render.h - pictures of a known object under known lights: Eq. 5 per pixel, with shadows and one bounce on request.
+#pragma once
+#include "solver/cameras.h"
+#include "solver/kernels/kernels.h"
+#include "solver/mesh.h"
+#include "solver/rays.h"
+#include "solver/take/image.h"
+
+enum reflectance { REFLECT_DISNEY, REFLECT_LAMBERT };
+
+// A material: textures over the mesh's atlas, or constants where a texture is NULL.
+struct render_material {
+    enum reflectance model;
+    enum disney_variant variant;
+    const struct image *albedo;     // R, G, B
+    const struct image *parameters; // ten channels named as disney_parameter_names
+    float constant_albedo[3];
+    float constant_theta[DISNEY_N];
+    bool nearest;                   // textures with sharp borders: nearest texel instead of bilinear
+};
+
+struct render_settings {
+    int samples;          // per pixel side: samples^2 rays on a regular grid (box filter)
+    bool shadows;
+    int shadow_rays;      // 0: one ray per light; else lights are put in groups of neighbours and this many rays per group
+                          // are spent on lights drawn by their energy (an unbiased estimate; seed decides)
+    int bounce_rays;      // 0: no indirect light; else diffuse interreflection gathered with this many rays per sample
+    int bounce_texture;   // size of the radiosity texture (e.g. 256)
+    uint64_t seed;
+    int n_threads;
+};
+
+struct renderer;
+// Keeps pointers to mesh, rays, lights, material until renderer_free(). Precomputes the radiosity texture when bouncing.
+int renderer_new(struct renderer **out, const struct mesh *mesh, const struct rays *rays,
+                 const struct lights *lights, const struct render_material *material,
+                 const struct render_settings *settings);
+// R, G, B, A (A: share of the pixel covered by the object). Same seed, same bytes, any thread count. 0 or -ENOMEM.
+int render_view(const struct renderer *r, const struct camera *camera, struct image *out);
+void renderer_free(struct renderer *r);

@@ -1,0 +1,49 @@
+// solver/take/image.h - linear images: float pixels in memory; EXR, Radiance HDR, 16-bit TIFF and PNG on disk.
+//
+// Pixels are row-major, top row first, channels interleaved: data[(y * width + x) * n_channels + c].
+// Values are linear light unless a function says otherwise. Names are EXR channel names without layer rules of ours:
+// "R", "G", "B", "A", "clip", "roughness", ...
+// Limits: 65,536 px a side, 2^28 pixels, 64 channels, and never more memory than 1,200 x the file's size (ZIP's best ratio)
+// plus 1 MiB: a small hostile file cannot ask for gigabytes.
+#pragma once
+#include <stdbool.h>
+#include <stdint.h>
+
+enum { IMAGE_NAME_MAX = 64, IMAGE_MAX_CHANNELS = 64 };
+
+struct image {
+    int width, height, n_channels;
+    char (*names)[IMAGE_NAME_MAX]; // [n_channels]
+    float *data;                   // [height][width][n_channels]
+};
+
+// Zeroed pixels. names: n_channels strings, NULL for R, G, B(, A) or Y. 0, -ENOMEM, -EINVAL.
+int image_new(struct image *out, int width, int height, int n_channels, const char *const *names);
+void image_free(struct image *image); // NULL and zeroed allowed; leaves it zeroed
+
+// Read by content, not by name: OpenEXR (single part, scanline or tiled, mip level 0, half/float/uint; the data window is
+// placed in the display window, outside it is 0), Radiance .hdr (new and old RLE, flat), TIFF (8/16-bit integer -> value /
+// 65535 or / 255, 32-bit float; 1, 3 or 4 samples, strips or tiles, linear), PNG (8/16-bit integer -> value / max, no
+// curve: for masks). R, G, B, A come first in that order when present, the others in file order.
+// Errors, logged with file, place, found, expected, remedy: -errno of the open, -EINVAL (broken or truncated), -ENOTSUP
+// (DWAA/DWAB, B44, deep, multi-part ...: "re-save as ZIP"), -EFBIG (over the limits), -ENOMEM.
+int image_read(struct image *out, const char *path);
+
+int image_channel(const struct image *image, const char *name); // index, or -1
+
+// -EDOM, logged with the first bad pixel and their count, if any value of the named channels (NULL: all) is NaN or infinite.
+int image_require_finite(const struct image *image, const char *const *names, const char *path);
+
+enum image_type { IMAGE_HALF, IMAGE_FLOAT };
+enum image_compression { IMAGE_ZIP, IMAGE_PIZ };
+// Atomic. Half saturates at +-65504 (never makes infinities). 0 or -errno (logged).
+int image_write_exr(const struct image *image, const char *path, enum image_type type,
+                    enum image_compression compression);
+// 8-bit PNG, n_channels 1 (grey), 3 or 4; pixels as they are (already encoded). Atomic. 0 or -errno (logged).
+int image_write_png(const char *path, int width, int height, int n_channels, const uint8_t *pixels);
+// Tone-mapped PNG of the first three (or the only) channel: value * 2^exposure_ev, clipped, sRGB curve.
+int image_write_png_srgb(const struct image *image, const char *path, double exposure_ev);
+
+// Bilinear sample of one channel set: out[n_channels] at continuous (x_px, y_px), first pixel centre at (.5, .5), clamped at
+// the borders.
+void image_bilinear(const struct image *image, double x_px, double y_px, float *out);
