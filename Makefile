@@ -18,7 +18,7 @@ FLAGS_debug := -O0 -g3
 FLAGS_asan := -O1 -g -fsanitize=address,undefined -fno-sanitize-recover=undefined -fno-omit-frame-pointer
 FLAGS_tsan := -O1 -g -fsanitize=thread
 FLAGS_fuzz := -O1 -g -fsanitize=fuzzer-no-link,address,undefined -fno-sanitize-recover=undefined
-CFLAGS_ALL = -std=gnu11 $(FLAGS_$(VARIANT)) -Wall -Wextra -Wshadow -Wstrict-prototypes -fno-math-errno -fno-trapping-math \
+CFLAGS_ALL = -std=gnu11 -D_GNU_SOURCE $(FLAGS_$(VARIANT)) -Wall -Wextra -Wshadow -Wstrict-prototypes -fno-math-errno -fno-trapping-math \
   -ffp-contract=off -ffile-prefix-map=$(CURDIR)=. -pthread -I. -I/usr/include/OpenEXR -I/usr/include/Imath \
   -DSTUDIORIG_VERSION='"$(VERSION)"' $(CFLAGS)
 EMBREE = $(shell test -e /usr/include/embree4/rtcore.h && echo embree4 || echo embree3)
@@ -49,8 +49,9 @@ endif
 all: $(BUILD)/bin/rigsolve
 .PHONY: all deps test demo bench chart stability fuzz check-includes install clean help man
 .DELETE_ON_ERROR:
+.SECONDARY:
 
-$(BUILD)/obj/%.o: %.c | $(FIRST)
+$(BUILD)/obj/%.o: %.c Makefile | $(FIRST)
 	@mkdir -p $(@D)
 	$(CC) $(CFLAGS_ALL) $(ISA) -MMD -MP -c $< -o $@
 $(BUILD)/obj/solver/kernels/kernels_avx2.o: ISA := $(ISA_avx2)
@@ -66,7 +67,6 @@ $(BUILD)/bin/rigsolve: $(COMMANDS_O) $(BUILD)/libstudiorig.a
 $(BUILD)/tests/%: $(BUILD)/obj/tests/%.o $(BUILD)/libstudiorig.a
 	@mkdir -p $(@D)
 	$(CC) $(CFLAGS_ALL) $^ -lcmocka $(LIBS) -o $@
-$(BUILD)/tests/test_%: tests/test_%.c
 
 clean:
 	rm -rf build
