@@ -229,8 +229,9 @@ void rays_start(const struct rays *r, uint32_t triangle, const float barycentric
         base[i] = (float)(point[i] + r->offset_m * normal[i]);
         towards[i] = (float)lift[i];
     }
-    // Another part of the surface within the lift: the facet itself is then the better start.
-    const bool lifted = vec3_norm(lift) > 0 && !rays_blocked(r, base, towards, 0, 1);
+    // Another part of the surface within the lift: the facet itself is then the better start. (Not asked of lifts as small as
+    // the offset itself: on fine meshes that saves a ray per point.)
+    const bool lifted = vec3_norm(lift) <= r->offset_m || !rays_blocked(r, base, towards, 0, 1);
     for (int i = 0; i < 3; i++)
         start_m[i] = lifted ? base[i] + towards[i] : base[i];
 }
