@@ -3,7 +3,7 @@
 // Documents are trees of struct json. Readers take a path of keys ("stage.joint.wall_s"; an array index is a
 // decimal key: "lights.3.dir_probe"). A missing or mistyped value is -ENOENT or -EINVAL and is *not* logged: the caller
 // knows whether it was needed; json_require_* log file, key, what was found, what was expected.
-// Numbers must be finite. Strings are UTF-8. Limits when reading: 256 MiB, nesting as jansson's (2048).
+// Numbers must be finite, keys unique. Strings are UTF-8 (when writing, a string that is not gets '?' for its high bytes). Limits when reading: 256 MiB, nesting as jansson's (2048).
 #pragma once
 #include <stdbool.h>
 #include <stddef.h>
@@ -26,15 +26,18 @@ int json_get_number(const struct json *v, const char *path, double *out);
 int json_get_int(const struct json *v, const char *path, int64_t *out); // -EINVAL for a fraction
 int json_get_bool(const struct json *v, const char *path, bool *out);
 int json_get_string(const struct json *v, const char *path, const char **out); // lives as long as the document
-// Exactly n numbers, nested arrays flattened row by row (a 3x3 matrix is n = 9).
+// Exactly n numbers, nested arrays flattened row by row (a 3x3 matrix is n = 9); a bare number counts as n = 1.
 int json_get_numbers(const struct json *v, const char *path, double *out, int n);
 
 int json_require_numbers(const struct json *v, const char *path, double *out, int n, const char *file);
 int json_require_string(const struct json *v, const char *path, const char **out, const char *file);
 
-// Writing. Building a tree never fails half way: out of memory is remembered and json_write returns -ENOMEM.
-struct json *json_object(void);
-struct json *json_array(void);
+// Writing. Building a tree never fails half way: out of memory is remembered and json_write returns -ENOMEM
+// (every later one of the process too: no half tree is ever written).
+struct json *json_new_object(void);
+struct json *json_new_array(void);
+#define json_object() json_new_object() // jansson owns the linker's names json_object and json_array
+#define json_array() json_new_array()
 void json_set(struct json *object, const char *key, struct json *value); // takes value
 void json_set_number(struct json *object, const char *key, double value); // not finite: null
 void json_set_int(struct json *object, const char *key, int64_t value);

@@ -1,0 +1,134 @@
+// solver/take/progress.c - a bar for people, JSON lines for rigd, silence otherwise.
+#include "solver/take/progress.h"
+
+#include <errno.h>
+#include <pthread.h>
+#include <signal.h>
+#include <stdatomic.h>
+#include <stdbool.h>
+#include <stdio.h>
+#include <time.h>
+#include <unistd.h>
+
+enum { BAR_CELLS = 24 };
+static const int64_t REDRAW_NS = 100000000;
+
+static pthread_mutex_t lock = PTHREAD_MUTEX_INITIALIZER;
+static int json_fd = -1;
+static bool on_terminal;
+static const char *stage; // NULL: none
+static int64_t total, begin_ns;
+static _Atomic int64_t done, next_draw_ns;
+
+static int64_t now_ns(void)
+{
+    struct timespec t;
+    clock_gettime(CLOCK_MONOTONIC, &t);
+    return (int64_t)t.tv_sec * 1000000000 + t.tv_nsec;
+}
+
+void progress_set_fd(int fd)
+{
+    pthread_mutex_lock(&lock);
+    json_fd = fd;
+    pthread_mutex_unlock(&lock);
+}
+
+// A reader that went away must not end hours of work: EPIPE instead of SIGPIPE, and silence from then on.
+static void write_json_line(const char *line, size_t n)
+{
+    sigset_t pipe_only, pending, old;
+    sigemptyset(&pipe_only);
+    sigaddset(&pipe_only, SIGPIPE);
+    sigpending(&pending);
+    pthread_sigmask(SIG_BLOCK, &pipe_only, &old);
+    ssize_t written;
+    do
+        written = write(json_fd, line, n);
+    while (written < 0 && errno == EINTR);
+    if (written < 0 && errno != EAGAIN) {
+        if (errno == EPIPE && !sigismember(&pending, SIGPIPE))
+            sigtimedwait(&pipe_only, NULL, &(struct timespec){ 0 });
+        json_fd = -1;
+    }
+    pthread_sigmask(SIG_SETMASK, &old, NULL);
+}
+
+static int format_time(char *text, size_t size, double seconds)
+{
+    const int64_t s = (int64_t)(seconds + .5);
+    if (s >= 3600)
+        return snprintf(text, size, "%lld:%02d:%02d", (long long)(s / 3600), (int)(s / 60 % 60),
+                        (int)(s % 60));
+    return snprintf(text, size, "%d:%02d", (int)(s / 60), (int)(s % 60));
+}
+
+// Called with the lock held.
+static void draw(int64_t now)
+{
+    const int64_t n = atomic_load(&done);
+    const double seconds = (double)(now - begin_ns) * 1e-9;
+    char line[256];
+    if (json_fd >= 0) {
+        // Milliseconds as integers: %f would follow the locale.
+        const int64_t ms = (now - begin_ns) / 1000000;
+        const int length = snprintf(line, sizeof(line),
+                                    "{\"stage\":\"%s\",\"done\":%lld,\"total\":%lld,\"seconds\":%lld.%03d}\n",
+                                    stage, (long long)n, (long long)total, (long long)(ms / 1000),
+                                    (int)(ms % 1000));
+        if (length > 0 && (size_t)length < sizeof(line))
+            write_json_line(line, (size_t)length);
+    }
+    if (!on_terminal)
+        return;
+    double share = total > 0 ? (double)n / (double)total : 0;
+    share = share < 0 ? 0 : share > 1 ? 1 : share;
+    char bar[BAR_CELLS + 1], elapsed[32], left[32] = "-:--";
+    for (int i = 0; i < BAR_CELLS; i++)
+        bar[i] = i < (int)(share * BAR_CELLS) ? '#' : '.';
+    bar[BAR_CELLS] = 0;
+    format_time(elapsed, sizeof(elapsed), seconds);
+    if (share > 0)
+        format_time(left, sizeof(left), seconds * (1 - share) / share);
+    fprintf(stderr, "\r\033[K%s [%s] %3d%%  %s elapsed, %s left", stage, bar, (int)(share * 100), elapsed,
+            left);
+    fflush(stderr);
+}
+
+void progress_begin(const char *name, int64_t n)
+{
+    pthread_mutex_lock(&lock);
+    stage = name;
+    total = n;
+    begin_ns = now_ns();
+    on_terminal = isatty(STDERR_FILENO);
+    atomic_store(&done, 0);
+    atomic_store(&next_draw_ns, begin_ns + REDRAW_NS);
+    draw(begin_ns);
+    pthread_mutex_unlock(&lock);
+}
+
+void progress_add(int64_t n)
+{
+    atomic_fetch_add(&done, n);
+    const int64_t now = now_ns();
+    if (now < atomic_load(&next_draw_ns) || pthread_mutex_trylock(&lock))
+        return;
+    if (stage && now >= atomic_load(&next_draw_ns)) {
+        atomic_store(&next_draw_ns, now + REDRAW_NS);
+        draw(now);
+    }
+    pthread_mutex_unlock(&lock);
+}
+
+void progress_end(void)
+{
+    pthread_mutex_lock(&lock);
+    if (stage) {
+        draw(now_ns());
+        if (on_terminal)
+            fputs("\r\033[K", stderr);
+        stage = NULL;
+    }
+    pthread_mutex_unlock(&lock);
+}
