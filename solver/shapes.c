@@ -221,11 +221,10 @@ static int make_pebble(struct builder *b, int detail)
 // ---- vase and bowl: a closed profile turned about z ----------------------------------------------------------------------
 //
 // The profile (r, z) is a uniform cubic B-spline from the lower pole to the upper pole; its control points are mirrored at
-// both poles, so the surface is smooth there. Four charts: a disc about each pole, and the wall between in two halves.
+// both poles, so the surface is smooth there. Charts: a disc about each pole, and between them bands of wall in two halves.
 struct profile {
     int n_control;
     double control[16][2];
-    double foot, mouth; // where the discs end, as shares of the length
     double r[PROFILE_STEPS + 1], z[PROFILE_STEPS + 1], s[PROFILE_STEPS + 1]; // sampled; s: arc length
 };
 
@@ -337,8 +336,9 @@ static void add_disc(struct builder *b, const struct turned *t, bool upper, int 
     }
 }
 
-static int make_turned(struct builder *b, int detail, const double (*control)[2], int n_control, double foot,
-                       double mouth)
+// cut[n_cuts]: where along the profile one chart ends and the next begins, as shares of its length.
+static int make_turned(struct builder *b, int detail, const double (*control)[2], int n_control, const double *cut,
+                       int n_cuts)
 {
     struct turned *t = calloc(1, sizeof(*t));
     if (!t)
@@ -355,15 +355,20 @@ static int make_turned(struct builder *b, int detail, const double (*control)[2]
     t->n_around = 2 * (int)fmax(4, round(sqrt(detail / 2. / rows_per_column) / 2));
     t->n_rows = (int)fmax(8, round(detail / 2. / t->n_around));
     t->step = length / t->n_rows;
-    const int rim0 = (int)fmax(1, round(foot * t->n_rows)), rim1 = (int)fmin(t->n_rows - 1, round(mouth * t->n_rows));
     const int n_half = t->n_around / 2;
-    int err = builder_new(b, (t->n_around + 2) * (t->n_rows + 4) + 2, 2 * t->n_around * t->n_rows);
+    int row[8]; // where the charts meet: at least one row each
+    for (int k = 0; k < n_cuts; k++) {
+        row[k] = (int)fmax(k ? row[k - 1] + 1 : 1, round(cut[k] * t->n_rows));
+        row[k] = (int)fmin(row[k], t->n_rows - n_cuts + k);
+    }
+    int err = builder_new(b, (t->n_around + 2) * (t->n_rows + 2 + n_cuts) + 2, 2 * t->n_around * t->n_rows);
     if (err)
         goto done;
-    for (int half = 0; half < 2; half++) {
-        begin_chart(b);
+    for (int part = 0; part < 2 * (n_cuts - 1); part++) {
+        const int from = row[part / 2], to = row[part / 2 + 1], half = part % 2;
         const uint32_t first = (uint32_t)b->n_vertices;
-        for (int j = rim0; j <= rim1; j++) {
+        begin_chart(b);
+        for (int j = from; j <= to; j++) {
             for (int i = 0; i <= n_half; i++) {
                 double place[3], normal[3];
                 turned_at(t, half * n_half + i, j, place, normal);
@@ -372,10 +377,10 @@ static int make_turned(struct builder *b, int detail, const double (*control)[2]
                 add_vertex(b, place, normal, r * M_PI * ((double)i / n_half - .5), t->step * j);
             }
         }
-        add_grid_triangles(b, first, n_half, rim1 - rim0);
+        add_grid_triangles(b, first, n_half, to - from);
     }
-    add_disc(b, t, false, rim0);
-    add_disc(b, t, true, rim1);
+    add_disc(b, t, false, row[0]);
+    add_disc(b, t, true, row[n_cuts - 1]);
 done:
     free(t);
     return err;
@@ -384,19 +389,20 @@ done:
 static int make_vase(struct builder *b, int detail)
 {
     static const double control[][2] = {
-        { .16, 0 },   { .42, 0 },    { .6, .12 },   { .82, .5 },   { .8, .98 },  { .48, 1.36 }, { .3, 1.68 },
-        { .4, 2.02 }, { .5, 2.14 },  { .38, 2.12 }, { .24, 1.86 }, { .14, 1.68 }, { .05, 1.66 },
+        { .16, 0 },    { .42, 0 },   { .6, .12 },  { .82, .5 },   { .8, .98 },   { .48, 1.36 },
+        { .32, 1.68 }, { .42, 2 },   { .56, 2.14 }, { .5, 2.28 }, { .36, 2.2 },  { .26, 1.95 },
+        { .18, 1.76 }, { .06, 1.72 },
     };
-    return make_turned(b, detail, control, sizeof(control) / sizeof(control[0]), .1, .82);
+    return make_turned(b, detail, control, sizeof(control) / sizeof(control[0]), (const double[]){ .1, .82 }, 2);
 }
 
 static int make_bowl(struct builder *b, int detail)
 {
     static const double control[][2] = {
-        { .15, 0 },   { .45, 0 },   { .72, .14 },  { .95, .42 }, { 1.05, .8 },
-        { .99, .9 },  { .9, .8 },   { .78, .44 },  { .55, .2 },  { .2, .1 },
+        { .15, 0 },   { .5, 0 },     { .84, .12 }, { 1.04, .48 }, { 1.08, .9 }, { 1.04, 1.1 },
+        { .9, 1.1 },  { .84, .9 },   { .8, .52 },  { .6, .27 },   { .2, .2 },
     };
-    return make_turned(b, detail, control, sizeof(control) / sizeof(control[0]), .16, .56);
+    return make_turned(b, detail, control, sizeof(control) / sizeof(control[0]), (const double[]){ .16, .56, .79 }, 3);
 }
 
 // ---- knot: a tube along a (2,3) torus knot ------------------------------------------------------------------------------
