@@ -143,12 +143,15 @@ void rays_free(struct rays *r)
     free(r);
 }
 
-// False for a ray that asks nothing: no direction, an empty interval, or a NaN anywhere.
+// Embree's own limit of coordinates; Debian's build asserts it.
+static const float MOST_COORDINATE = 1.8e18f;
+
+// False for a ray that asks nothing: no direction, an empty interval, a NaN anywhere, or out of all bounds.
 static bool make_ray(struct RTCRay *ray, const float origin_m[3], const float dir[3], float t_min,
                      float t_max)
 {
     for (int i = 0; i < 3; i++)
-        if (!isfinite(origin_m[i]) || !isfinite(dir[i]))
+        if (!(fabsf(origin_m[i]) <= MOST_COORDINATE) || !(fabsf(dir[i]) <= MOST_COORDINATE))
             return false;
     if ((dir[0] == 0 && dir[1] == 0 && dir[2] == 0) || !(t_min < t_max))
         return false;

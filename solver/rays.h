@@ -18,7 +18,7 @@ int rays_new(struct rays **out, const struct mesh *mesh);
 void rays_free(struct rays *r); // NULL allowed
 
 // Anything between t_min and t_max? dir need not be unit; t is in units of |dir|; t below 0 never counts. A ray that asks
-// nothing (NaN, infinite origin, zero dir, t_max <= t_min) hits nothing.
+// nothing (NaN, coordinates beyond 1.8e18, zero dir, t_max <= t_min) hits nothing.
 bool rays_blocked(const struct rays *r, const float origin_m[3], const float dir[3], float t_min, float t_max);
 // The first hit; false: none.
 bool rays_hit(const struct rays *r, const float origin_m[3], const float dir[3], float t_min, float t_max,

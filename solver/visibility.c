@@ -104,7 +104,7 @@ static double invert_sum(double target, int begin, int end, double (*weight)(con
         if (!(w > 0))
             continue;
         if (target < w)
-            return i + fmax(target, 0) / w;
+            return i + fmin(fmax(target, 0) / w, 1 - 1e-9); // never rounded up into the next one
         position = i + .5;
         target -= w;
     }

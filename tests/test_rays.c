@@ -239,7 +239,7 @@ static void coarse_sphere_does_not_shadow_itself_above_its_normals_horizon(void 
         for (int c = 0; c < 3; c++)
             dir[c] = random_normal(4, (uint64_t)i, (uint64_t)c);
         vec3_normalise(dir);
-        if (vec3_dot(dir, normal) < .3)
+        if (vec3_dot(dir, normal) < .001)
             continue;
         float start[3], flat[3];
         const float d[3] = { (float)dir[0], (float)dir[1], (float)dir[2] };
@@ -249,8 +249,7 @@ static void coarse_sphere_does_not_shadow_itself_above_its_normals_horizon(void 
             flat[c] = (float)(point[c] + rays_offset_m(rays) * normal[c]);
         n_flat_would_fail += rays_blocked(rays, flat, d, 0, INFINITY);
     }
-    // The lift is needed: horizons of facet and normal differ by up to 15 degrees and more here... at .3 a few rays show it.
-    (void)n_flat_would_fail;
+    assert_in_range(n_flat_would_fail, 100, 20000); // or the sphere would not be coarse enough to try it
     rays_free(rays);
     mesh_free(&mesh);
 }
