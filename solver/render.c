@@ -42,7 +42,8 @@ struct renderer {
 
 // What one thread needs while shading.
 struct scratch {
-    struct lit lit, bounced;
+    struct lit lit;
+    struct light_arrays bounced; // what the bounce rays met, as lights at infinity
     uint16_t *visible;
     uint8_t *share;
 };
@@ -56,7 +57,8 @@ static int n_workers_of(const struct renderer *r)
 static void scratch_free(struct scratch *s, int n)
 {
     for (int i = 0; s && i < n; i++) {
-        lit_free(&s[i].lit), lit_free(&s[i].bounced);
+        lit_free(&s[i].lit);
+        light_arrays_free(&s[i].bounced);
         free(s[i].visible), free(s[i].share);
     }
     free(s);
@@ -64,17 +66,21 @@ static void scratch_free(struct scratch *s, int n)
 
 static struct scratch *scratch_new(const struct renderer *r, int n)
 {
+    const int n_bounced = r->settings.bounce_rays > 0 ? r->settings.bounce_rays : 1;
+    const int n_lit = n_bounced > r->lights.n_padded ? n_bounced : r->lights.n_padded;
+    struct lights bounced;
+    if (lights_new(&bounced, n_bounced))
+        return NULL;
     struct scratch *s = calloc((size_t)n, sizeof(*s));
     for (int i = 0; s && i < n; i++) {
         s[i].visible = calloc((size_t)r->lights.n_padded / 16, sizeof(*s[i].visible));
         s[i].share = calloc((size_t)r->lights.n_padded, sizeof(*s[i].share));
-        const int n_bounced = r->settings.bounce_rays > 0 ? r->settings.bounce_rays : 1;
-        if (!s[i].visible || !s[i].share || lit_new(&s[i].lit, r->lights.n_padded) ||
-            lit_new(&s[i].bounced, n_bounced)) {
+        if (!s[i].visible || !s[i].share || lit_new(&s[i].lit, n_lit) || light_arrays_new(&s[i].bounced, &bounced)) {
             scratch_free(s, n);
-            return NULL;
+            s = NULL;
         }
     }
+    lights_free(&bounced);
     return s;
 }
 
@@ -446,7 +452,8 @@ static double radical_inverse2(uint32_t k)
     return x;
 }
 
-// Light from other parts of the object into s->bounced, as K lights of weight pi / K times their radiance.
+// Light from other parts of the object into s->bounced: a light per ray that gives pi / K times the radiance it met, after
+// the cosine that the kernels will multiply by.
 static void gather_bounce(const struct renderer *r, const struct point *p, const float start_m[3],
                           struct stream stream, struct scratch *s)
 {
@@ -454,30 +461,27 @@ static void gather_bounce(const struct renderer *r, const struct point *p, const
     const double shift[2] = { random_uniform(stream.seed, stream.stream, BOUNCE_INDEX),
                               random_uniform(stream.seed, stream.stream, BOUNCE_INDEX + 1) };
     const struct surface_point *f = &p->surface;
-    struct lit *lit = &s->bounced;
-    lit->n = 0;
+    struct light_arrays *a = &s->bounced;
     for (int k = 0; k < n; k++) {
-        const double a = (k + shift[0]) / n, b = radical_inverse2((uint32_t)k) + shift[1];
-        const double sine = sqrt(a), cosine = sqrt(1 - a), angle = 2 * M_PI * b;
-        float dir[3], radiance[IMAGE_MAX_CHANNELS], uv[2];
+        const double x = (k + shift[0]) / n, y = radical_inverse2((uint32_t)k) + shift[1];
+        const double sine = sqrt(x), cosine = sqrt(1 - x), angle = 2 * M_PI * y;
+        float dir[3], radiance[IMAGE_MAX_CHANNELS] = { 0 }, uv[2];
+        double facet[3];
+        struct ray_hit hit;
         for (int i = 0; i < 3; i++)
             dir[i] = (float)(sine * cos(angle) * f->tangent[i] + sine * sin(angle) * f->bitangent[i] +
                              cosine * f->normal[i]);
-        struct ray_hit hit;
-        if (!rays_hit(r->rays, start_m, dir, 0, INFINITY, &hit))
-            continue;
-        double facet[3];
-        facet_normal(r->mesh, hit.triangle, facet);
-        if (facet[0] * dir[0] + facet[1] * dir[1] + facet[2] * dir[2] >= 0)
-            continue; // seen from inside
-        interpolate_uv(r->mesh, hit.triangle, (const float[2]){ hit.u, hit.v }, uv);
-        look_up(&r->radiosity, false, uv, radiance);
-        const int i = lit->n++;
-        const float weight = (float)(M_PI / n);
-        lit->lx[i] = dir[0], lit->ly[i] = dir[1], lit->lz[i] = dir[2];
-        lit->nl[i] = (float)cosine;
-        lit->sl[i] = (float)pow(1 - cosine, 5);
-        lit->wr[i] = weight * radiance[0], lit->wg[i] = weight * radiance[1], lit->wb[i] = weight * radiance[2];
+        const float towards = dot3f(dir, f->normal);
+        if (towards > 0 && rays_hit(r->rays, start_m, dir, 0, INFINITY, &hit)) {
+            facet_normal(r->mesh, hit.triangle, facet);
+            if (facet[0] * dir[0] + facet[1] * dir[1] + facet[2] * dir[2] < 0) { // not from inside
+                interpolate_uv(r->mesh, hit.triangle, (const float[2]){ hit.u, hit.v }, uv);
+                look_up(&r->radiosity, false, uv, radiance);
+            }
+        }
+        const float weight = towards > 0 ? (float)(M_PI / n) / towards : 0;
+        a->dx[k] = dir[0], a->dy[k] = dir[1], a->dz[k] = dir[2];
+        a->cr[k] = weight * radiance[0], a->cg[k] = weight * radiance[1], a->cb[k] = weight * radiance[2];
     }
 }
 
@@ -497,15 +501,17 @@ static void shade_point(const struct renderer *r, const struct point *p, const f
     if (bounce)
         gather_bounce(r, p, start_m, stream, s);
     if (lambert) {
-        for (int i = 0; bounce && i < s->bounced.n; i++)
-            E[0] += s->bounced.wr[i], E[1] += s->bounced.wg[i], E[2] += s->bounced.wb[i];
+        if (bounce)
+            r->kernels->irradiance(indirect, &s->bounced, &p->surface, NULL);
         for (int c = 0; c < 3; c++)
-            L[c] = E[c] * p->material.albedo[c] * (float)M_1_PI;
+            L[c] = (E[c] + indirect[c]) * p->material.albedo[c] * (float)M_1_PI;
         return;
     }
     r->kernels->shade(L, &s->lit, &p->surface, vf, &p->material);
-    if (bounce && s->bounced.n)
-        r->kernels->shade(indirect, &s->bounced, &p->surface, vf, &p->material);
+    if (!bounce)
+        return;
+    r->kernels->gather(&s->lit, &s->bounced, &p->surface, NULL, NULL);
+    r->kernels->shade(indirect, &s->lit, &p->surface, vf, &p->material);
     for (int c = 0; c < 3; c++)
         L[c] += indirect[c];
 }
