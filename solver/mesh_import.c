@@ -20,7 +20,7 @@
 #include <stdlib.h>
 #include <string.h>
 
-enum { MAX_TRIANGLES = 1 << 26, MAX_NODES = 1 << 20, FORMAT_NONE = -1 };
+enum { MAX_TRIANGLES = 1 << 26, GLTF_MAX_DEPTH = 256 };
 static const size_t max_file_bytes = (size_t)8 << 30;
 
 __attribute__((format(printf, 3, 4))) static int refuse(const struct mesh_file *f, int err, const char *format, ...)
@@ -171,7 +171,8 @@ static int check_obj(const struct mesh_file *f)
         const char *text = at, *word;
         const size_t n = next_word(&text, stop, &word);
         int err = 0;
-        if (n > 0 && stop[-1] == '\\')
+        const char *last = stop - (stop > at && stop[-1] == '\r');
+        if (last > at && last[-1] == '\\')
             err = refuse(f, -ENOTSUP, "line %" PRId64 ": continued on the next line by \\: write it as one line", o.line);
         else if (n == 1 && *word == 'v')
             err = check_obj_numbers(&o, text, stop, 0, 3);
@@ -348,7 +349,8 @@ static bool ply_value(struct ply *p, int size, int64_t *out)
 
 static int ply_element_data(struct ply *p, const struct ply_element *e, uint64_t n_vertices)
 {
-    for (uint64_t i = 0; i < e->count; i++) {
+    uint64_t i = 0;
+    for (; i < e->count; i++) {
         for (int k = 0; k < e->n_properties; k++) {
             const struct ply_property *q = &e->property[k];
             int64_t n = 1, value;
@@ -371,8 +373,7 @@ static int ply_element_data(struct ply *p, const struct ply_element *e, uint64_t
     return 0;
 cut_short:
     return refuse(p->file, -EINVAL, "the data end (or are no number) at offset %td, within %s %" PRIu64 " of %" PRIu64
-                  " announced: the file is cut short or broken", p->at - p->file->bytes, e->name, (uint64_t)0 + e->count,
-                  e->count);
+                  " announced: the file is cut short or broken", p->at - p->file->bytes, e->name, i + 1, e->count);
 }
 
 static int check_ply(const struct mesh_file *f)
@@ -526,6 +527,41 @@ static int check_gltf_meshes(const struct mesh_file *f, const struct json *doc)
     return 0;
 }
 
+// assimp walks nodes by recursion: they must be a tree, and not a deep one.
+static int check_gltf_nodes(const struct mesh_file *f, const struct json *doc)
+{
+    int err = 0;
+    const int64_t n = gltf_length(doc, "nodes");
+    int64_t *parent = malloc((size_t)(n + 1) * sizeof(*parent));
+    if (!parent)
+        return -ENOMEM;
+    memset(parent, 0xff, (size_t)(n + 1) * sizeof(*parent));
+    for (int64_t i = 0; i < n && !err; i++) {
+        char path[64];
+        snprintf(path, sizeof(path), "nodes.%" PRId64 ".children", i);
+        for (int64_t k = 0, n_children = gltf_length(doc, path); k < n_children && !err; k++) {
+            int64_t child;
+            snprintf(path, sizeof(path), "nodes.%" PRId64 ".children.%" PRId64, i, k);
+            if (json_get_int(doc, path, &child) || child < 0 || child >= n)
+                err = refuse(f, -EINVAL, "node %" PRId64 ": child %" PRId64 " does not exist", i, k);
+            else if (parent[child] >= 0)
+                err = refuse(f, -EINVAL, "node %" PRId64 " is a child of nodes %" PRId64 " and %" PRId64 "; expected a tree",
+                             child, parent[child], i);
+            else
+                parent[child] = i;
+        }
+    }
+    for (int64_t i = 0; i < n && !err; i++) {
+        int depth = 0;
+        for (int64_t k = i; k >= 0 && depth <= GLTF_MAX_DEPTH; k = parent[k])
+            depth++;
+        if (depth > GLTF_MAX_DEPTH)
+            err = refuse(f, -EINVAL, "node %" PRId64 " is nested more than %d deep, or within itself", i, GLTF_MAX_DEPTH);
+    }
+    free(parent);
+    return err;
+}
+
 // A buffer's own bytes are looked for by assimp (a file beside, base64 text), except a GLB's BIN chunk: n_bin.
 static int check_gltf_json(const struct mesh_file *f, const char *text, size_t n_text, int64_t n_bin)
 {
@@ -558,6 +594,8 @@ static int check_gltf_json(const struct mesh_file *f, const char *text, size_t n
         err = check_gltf_accessor(f, doc, i);
     if (!err)
         err = check_gltf_meshes(f, doc);
+    if (!err)
+        err = check_gltf_nodes(f, doc);
     json_free(doc);
     return err;
 }
@@ -863,7 +901,7 @@ typedef int visit_mesh(void *arg, const struct aiMesh *mesh, const double world[
 
 static int walk_nodes(const struct aiScene *scene, visit_mesh *visit, void *arg)
 {
-    int err = 0, n = 0, capacity = 0, n_seen = 0;
+    int err = 0, n = 0, capacity = 0;
     struct entry {
         const struct aiNode *node;
         double world[16];
@@ -878,9 +916,10 @@ static int walk_nodes(const struct aiScene *scene, visit_mesh *visit, void *arg)
                 err = visit(arg, scene->mMeshes[e.node->mMeshes[i]], e.world);
         for (unsigned i = e.node->mNumChildren; i-- > 0 && !err;) { // backwards: the first child comes off the stack first
             if (n == capacity) {
-                struct entry *bigger = realloc(stack, (size_t)(capacity = capacity ? 2 * capacity : 64) * sizeof(*stack));
-                if (!bigger || ++n_seen > MAX_NODES) {
-                    free(bigger ? bigger : stack);
+                capacity = capacity ? 2 * capacity : 64;
+                struct entry *bigger = realloc(stack, (size_t)capacity * sizeof(*stack));
+                if (!bigger) {
+                    free(stack);
                     return -ENOMEM;
                 }
                 stack = bigger;
