@@ -31,6 +31,9 @@ struct texels {
 int texels_rasterise(struct texels *out, const struct mesh *mesh, int size);
 void texels_free(struct texels *t); // leaves it zeroed
 
+// How many triangles (at most 255) cover the centre of each texel: count[size*size], image order. 1 <= size <= 16384.
+void texels_count_cover(uint8_t *count, const struct mesh *mesh, int size);
+
 // Gutter: copy every covered texel's values outwards into the uncovered ones up to radius_px away (nearest covered texel; ties
 // to the lower pixel index), so that bilinear look-ups at chart borders do not bleed. image: [size*size][n_channels].
 int texels_fill_gutter(const struct texels *t, float *image, int n_channels, int radius_px);

@@ -1,0 +1,451 @@
+// solver/cameras.c - the camera itself (projection, its derivative, its inverse), and which reader takes a file.
+#include "solver/cameras.h"
+#include "solver/cameras_format.h"
+#include "solver/take/log.h"
+#include "solver/vec3.h"
+
+#include <dirent.h>
+#include <errno.h>
+#include <stdio.h>
+#include <stdlib.h>
+#include <string.h>
+#include <strings.h>
+#include <sys/stat.h>
+
+static const double min_depth = 1e-9;
+
+// ---- distortion ---------------------------------------------------------------------------------------------------------
+
+// Is c[0] + c[1] s + ... + c[degree] s^degree > 0 all over [0, s_max]? Bernstein coefficients bound a polynomial from both sides;
+// halve the interval until they decide.
+enum { MAX_DEGREE = 6 };
+
+static bool bernstein_is_positive(const double *b, int degree, int depth)
+{
+    bool all = true;
+    for (int i = 0; i <= degree; i++)
+        all = all && b[i] > 0;
+    if (all)
+        return true;
+    if (!(b[0] > 0 && b[degree] > 0) || depth == 0) // the outer two are values of the polynomial
+        return false;
+    double left[MAX_DEGREE + 1], right[MAX_DEGREE + 1];
+    memcpy(right, b, (size_t)(degree + 1) * sizeof(*b));
+    for (int i = 0; i <= degree; i++) { // de Casteljau: what the passes leave behind in right[] is the right half
+        left[i] = right[0];
+        for (int j = 0; j < degree - i; j++)
+            right[j] = .5 * (right[j] + right[j + 1]);
+    }
+    return bernstein_is_positive(left, degree, depth - 1) && bernstein_is_positive(right, degree, depth - 1);
+}
+
+static bool polynomial_is_positive(const double *c, int degree, double s_max)
+{
+    static const double choose[MAX_DEGREE + 1][MAX_DEGREE + 1] = {
+        { 1 }, { 1, 1 }, { 1, 2, 1 }, { 1, 3, 3, 1 }, { 1, 4, 6, 4, 1 }, { 1, 5, 10, 10, 5, 1 }, { 1, 6, 15, 20, 15, 6, 1 },
+    };
+    double b[MAX_DEGREE + 1] = { 0 }, power = 1;
+    for (int j = 0; j <= degree; j++, power *= s_max)
+        for (int i = j; i <= degree; i++)
+            b[i] += choose[i][j] / choose[degree][j] * c[j] * power;
+    return bernstein_is_positive(b, degree, 24);
+}
+
+// Does the radius still grow with the angle, everywhere between the axis and here? (Behind the fold, a pixel has two rays.)
+static bool is_monotonic(const struct camera *c, double s) // s: r^2, fisheye: angle^2
+{
+    const double *k = c->k;
+    if (c->model != CAMERA_RATIONAL) {
+        const double d[5] = { 1, 3 * k[0], 5 * k[1], 7 * k[2], 9 * k[3] };
+        if (k[0] >= 0 && k[1] >= 0 && k[2] >= 0 && k[3] >= 0)
+            return true;
+        return polynomial_is_positive(d, 4, s);
+    }
+    const double n[4] = { 1, k[0], k[1], k[2] }, d[4] = { 1, k[3], k[4], k[5] };
+    double slope[MAX_DEGREE + 1] = { 0 }; // (N + 2 s N') D - 2 s N D'
+    for (int i = 0; i < 4; i++)
+        for (int j = 0; j < 4; j++)
+            slope[i + j] += (1 + 2 * i - 2 * j) * n[i] * d[j];
+    return polynomial_is_positive(d, 3, s) && polynomial_is_positive(slope, MAX_DEGREE, s);
+}
+
+static bool is_undistorted(const struct camera *c)
+{
+    for (int i = 0; i < 6; i++)
+        if (c->k[i] != 0)
+            return false;
+    return c->model != CAMERA_FISHEYE && c->p[0] == 0 && c->p[1] == 0;
+}
+
+// d[2] = distorted (x, y), D = its 2x2 derivative. False beyond the monotonic range.
+static bool distort(const struct camera *c, double x, double y, double d[2], double D[4])
+{
+    const double *k = c->k, *p = c->p;
+    const double s = x * x + y * y;
+    double f, f_s; // radial factor, and its derivative by s = r^2
+    if (is_undistorted(c)) {
+        d[0] = x, d[1] = y;
+        D[0] = D[3] = 1, D[1] = D[2] = 0;
+        return true;
+    }
+    if (c->model == CAMERA_FISHEYE) {
+        const double r = sqrt(s), a = atan(r), a2 = a * a;
+        const double ad = a * (1 + a2 * (k[0] + a2 * (k[1] + a2 * (k[2] + a2 * k[3]))));
+        const double slope = 1 + a2 * (3 * k[0] + a2 * (5 * k[1] + a2 * (7 * k[2] + a2 * 9 * k[3])));
+        if (!is_monotonic(c, a2))
+            return false;
+        if (r < 1e-4) // series: a = r - r^3 / 3
+            f = 1 + (k[0] - 1. / 3) * s, f_s = k[0] - 1. / 3;
+        else
+            f = ad / r, f_s = (slope / (1 + s) - f) / (2 * s);
+    } else {
+        if (!is_monotonic(c, s))
+            return false;
+        if (c->model == CAMERA_BROWN) {
+            f = 1 + s * (k[0] + s * (k[1] + s * (k[2] + s * k[3])));
+            f_s = k[0] + s * (2 * k[1] + s * (3 * k[2] + s * 4 * k[3]));
+        } else {
+            const double n = 1 + s * (k[0] + s * (k[1] + s * k[2])), m = 1 + s * (k[3] + s * (k[4] + s * k[5]));
+            const double n_s = k[0] + s * (2 * k[1] + s * 3 * k[2]), m_s = k[3] + s * (2 * k[4] + s * 3 * k[5]);
+            f = n / m, f_s = (n_s - f * m_s) / m;
+        }
+    }
+    d[0] = x * f, d[1] = y * f;
+    D[0] = f + 2 * x * x * f_s, D[1] = D[2] = 2 * x * y * f_s, D[3] = f + 2 * y * y * f_s;
+    if (c->model != CAMERA_FISHEYE && (p[0] != 0 || p[1] != 0)) {
+        const double tx = 2 * p[0] * x * y + p[1] * (s + 2 * x * x), ty = 2 * p[1] * x * y + p[0] * (s + 2 * y * y);
+        const double g = 1 + s * (p[2] + s * p[3]), g_s = p[2] + 2 * s * p[3];
+        d[0] += tx * g, d[1] += ty * g;
+        D[0] += (2 * p[0] * y + 6 * p[1] * x) * g + tx * g_s * 2 * x;
+        D[1] += (2 * p[0] * x + 2 * p[1] * y) * g + tx * g_s * 2 * y;
+        D[2] += (2 * p[1] * y + 2 * p[0] * x) * g + ty * g_s * 2 * x;
+        D[3] += (2 * p[1] * x + 6 * p[0] * y) * g + ty * g_s * 2 * y;
+    }
+    return isfinite(d[0]) && isfinite(d[1]);
+}
+
+// Newton with halved steps where a full one does not help. False: no solution near.
+static bool undistort_newton(const struct camera *c, const double d[2], double xy[2])
+{
+    double x = d[0], y = d[1], e[2], D[4];
+    while (!distort(c, x, y, e, D)) { // start inside the model's range
+        x *= .5, y *= .5;
+        if (fabs(x) + fabs(y) < 1e-12)
+            return false;
+    }
+    double r0 = e[0] - d[0], r1 = e[1] - d[1];
+    for (int i = 0; i < 50; i++) {
+        const double det = D[0] * D[3] - D[1] * D[2];
+        if (!(fabs(det) > 1e-12))
+            return false;
+        const double sx = -(D[3] * r0 - D[1] * r1) / det, sy = -(D[0] * r1 - D[2] * r0) / det;
+        const double before = hypot(r0, r1);
+        if (before < 1e-16 * (1 + hypot(d[0], d[1])))
+            break;
+        double step = 1;
+        for (;; step *= .5) {
+            if (step < 1e-6) // as good as it gets
+                goto done;
+            if (!distort(c, x + step * sx, y + step * sy, e, D))
+                continue;
+            if (hypot(e[0] - d[0], e[1] - d[1]) < before)
+                break;
+        }
+        x += step * sx, y += step * sy;
+        r0 = e[0] - d[0], r1 = e[1] - d[1];
+    }
+done:
+    xy[0] = x, xy[1] = y;
+    return hypot(r0, r1) < 1e-10;
+}
+
+// The angle whose distorted angle is ad: the slope is positive over the whole range, so bisection guards Newton.
+static bool fisheye_angle(const struct camera *c, double ad, double *angle)
+{
+    const double *k = c->k;
+    double lo = 0, hi = 1.5707963267948966;
+    if (!is_monotonic(c, hi * hi)) { // shrink to the monotonic range
+        double bad = hi;
+        hi = 0;
+        for (int i = 0; i < 50; i++) {
+            const double middle = .5 * (hi + bad);
+            if (is_monotonic(c, middle * middle))
+                hi = middle;
+            else
+                bad = middle;
+        }
+    }
+    double a = ad < hi ? ad : .5 * hi, f = 1;
+    for (int i = 0; i < 100; i++) {
+        const double a2 = a * a;
+        f = a * (1 + a2 * (k[0] + a2 * (k[1] + a2 * (k[2] + a2 * k[3])))) - ad;
+        const double slope = 1 + a2 * (3 * k[0] + a2 * (5 * k[1] + a2 * (7 * k[2] + a2 * 9 * k[3])));
+        if (f > 0)
+            hi = a;
+        else
+            lo = a;
+        double next = a - f / slope;
+        if (!(next >= lo && next <= hi))
+            next = .5 * (lo + hi);
+        const bool is_done = fabs(next - a) < 1e-16 + 2e-16 * a;
+        a = next;
+        if (is_done)
+            break;
+    }
+    *angle = a;
+    return fabs(f) < 1e-10;
+}
+
+// ---- the camera ---------------------------------------------------------------------------------------------------------
+
+static bool project(const struct camera *c, const double point_m[3], double uv_px[2], double *depth_m, double *J)
+{
+    double q[3], d[2], D[4];
+    mat3_mul_vec(q, c->cam_from_world, point_m);
+    for (int i = 0; i < 3; i++)
+        q[i] += c->t_m[i];
+    if (!(q[2] > min_depth))
+        return false;
+    const double x = q[0] / q[2], y = q[1] / q[2];
+    if (!distort(c, x, y, d, D))
+        return false;
+    uv_px[0] = c->fx * d[0] + c->skew * d[1] + c->cx;
+    uv_px[1] = c->fy * d[1] + c->cy;
+    if (depth_m)
+        *depth_m = q[2];
+    if (!J)
+        return true;
+    const double by_xy[4] = {
+        c->fx * D[0] + c->skew * D[2], c->fx * D[1] + c->skew * D[3],
+        c->fy * D[2], c->fy * D[3],
+    };
+    for (int row = 0; row < 2; row++) {
+        const double a = by_xy[2 * row], b = by_xy[2 * row + 1];
+        const double by_q[3] = { a / q[2], b / q[2], -(a * x + b * y) / q[2] };
+        mat3_tmul_vec(J + 3 * row, c->cam_from_world, by_q);
+    }
+    return true;
+}
+
+bool camera_project(const struct camera *c, const double point_m[3], double uv_px[2], double *depth_m)
+{
+    return project(c, point_m, uv_px, depth_m, NULL);
+}
+
+bool camera_project_jacobian(const struct camera *c, const double point_m[3], double uv_px[2], double J[6])
+{
+    return project(c, point_m, uv_px, NULL, J);
+}
+
+bool camera_ray(const struct camera *c, const double uv_px[2], double dir_world[3])
+{
+    double d[2], q[3];
+    d[1] = (uv_px[1] - c->cy) / c->fy;
+    d[0] = (uv_px[0] - c->cx - c->skew * d[1]) / c->fx;
+    if (!isfinite(d[0]) || !isfinite(d[1]))
+        return false;
+    if (c->model == CAMERA_FISHEYE) {
+        const double ad = hypot(d[0], d[1]);
+        double a;
+        if (!fisheye_angle(c, ad, &a))
+            return false;
+        const double sine_per_ad = ad > 1e-12 ? sin(a) / ad : 1;
+        q[0] = d[0] * sine_per_ad, q[1] = d[1] * sine_per_ad, q[2] = cos(a);
+        if (!(q[2] > 0))
+            return false;
+    } else if (is_undistorted(c)) {
+        q[0] = d[0], q[1] = d[1], q[2] = 1;
+    } else {
+        if (!undistort_newton(c, d, q))
+            return false;
+        q[2] = 1;
+    }
+    mat3_tmul_vec(dir_world, c->cam_from_world, q);
+    vec3_normalise(dir_world);
+    return true;
+}
+
+void camera_look_at(struct camera *c, const double centre_m[3], const double target_m[3], const double up[3])
+{
+    double forward[3], right[3], down[3];
+    vec3_sub(forward, target_m, centre_m);
+    if (vec3_normalise(forward) == 0)
+        forward[2] = 1;
+    vec3_cross(right, forward, up);
+    if (vec3_normalise(right) <= 1e-12 * vec3_norm(up)) { // looking along up: any right will do
+        const double other[3] = { fabs(forward[0]) < .6, fabs(forward[0]) >= .6, 0 };
+        vec3_cross(right, forward, other);
+        vec3_normalise(right);
+    }
+    vec3_cross(down, forward, right);
+    for (int i = 0; i < 3; i++) {
+        c->cam_from_world[i] = right[i];
+        c->cam_from_world[3 + i] = down[i];
+        c->cam_from_world[6 + i] = forward[i];
+        c->centre_m[i] = centre_m[i];
+    }
+    mat3_mul_vec(c->t_m, c->cam_from_world, centre_m);
+    for (int i = 0; i < 3; i++)
+        c->t_m[i] = -c->t_m[i];
+}
+
+void camera_resize(struct camera *c, int width_px, int height_px)
+{
+    const double sx = (double)width_px / c->width_px, sy = (double)height_px / c->height_px;
+    c->fx *= sx, c->skew *= sx, c->cx *= sx;
+    c->fy *= sy, c->cy *= sy;
+    c->width_px = width_px, c->height_px = height_px;
+}
+
+// ---- the set ------------------------------------------------------------------------------------------------------------
+
+const struct camera *cameras_find(const struct cameras *c, const char *name)
+{
+    for (int i = 0; i < c->n; i++)
+        if (!strcmp(c->view[i].name, name))
+            return &c->view[i];
+    return NULL;
+}
+
+void cameras_free(struct cameras *c)
+{
+    if (!c)
+        return;
+    free(c->view);
+    memset(c, 0, sizeof(*c));
+}
+
+int camera_set_name(struct camera *c, const char *file, size_t n_file)
+{
+    const char *slash = memrchr(file, '/', n_file);
+    if (slash)
+        n_file -= (size_t)(slash + 1 - file), file = slash + 1;
+    const char *dot = memrchr(file, '.', n_file);
+    if (dot && dot > file)
+        n_file = (size_t)(dot - file);
+    if (n_file == 0 || n_file >= sizeof(c->name))
+        return -EINVAL;
+    for (size_t i = 0; i < n_file; i++)
+        if ((unsigned char)file[i] < ' ' || file[i] == 0x7f)
+            return -EINVAL;
+    memcpy(c->name, file, n_file);
+    c->name[n_file] = 0;
+    return 0;
+}
+
+static int compare_names(const void *a, const void *b)
+{
+    const struct camera *const *x = a, *const *y = b;
+    return strcmp((*x)->name, (*y)->name);
+}
+
+int cameras_check_names(const struct cameras *c, const char *path)
+{
+    int err = 0;
+    const struct camera **sorted = malloc((size_t)c->n * sizeof(*sorted));
+    if (!sorted)
+        return -ENOMEM;
+    for (int i = 0; i < c->n; i++)
+        sorted[i] = &c->view[i];
+    qsort(sorted, (size_t)c->n, sizeof(*sorted), compare_names);
+    for (int i = 1; i < c->n && !err; i++)
+        if (!strcmp(sorted[i - 1]->name, sorted[i]->name)) {
+            log_error("cameras: %s: two images are called '%s' (folder and extension apart); rename one: views are known "
+                      "by that name", path, sorted[i]->name);
+            err = -EINVAL;
+        }
+    free(sorted);
+    return err;
+}
+
+// ---- which reader -------------------------------------------------------------------------------------------------------
+
+static bool starts_with(const char *text, const char *prefix)
+{
+    return !strncmp(text, prefix, strlen(prefix));
+}
+
+static bool is_bundler(const struct cameras_source *s)
+{
+    return starts_with(s->head, "# Bundle file");
+}
+
+static bool is_metashape(const struct cameras_source *s)
+{
+    return strstr(s->head, "<document") && s->head[strspn(s->head, " \t\r\n\xef\xbb\xbf")] == '<';
+}
+
+static bool has_xmp_sidecars(const char *folder)
+{
+    DIR *dir = opendir(folder);
+    bool found = false;
+    for (struct dirent *e = dir ? readdir(dir) : NULL; e && !found; e = readdir(dir)) {
+        const size_t n = strlen(e->d_name);
+        found = n > 4 && !strcasecmp(e->d_name + n - 4, ".xmp");
+    }
+    if (dir)
+        closedir(dir);
+    return found;
+}
+
+static bool is_reality_capture(const struct cameras_source *s)
+{
+    return s->is_folder ? has_xmp_sidecars(s->path)
+                        : strstr(s->head, "x:xmpmeta") || strstr(s->head, "capturingreality.com");
+}
+
+static bool is_meshroom(const struct cameras_source *s)
+{
+    return s->head[strspn(s->head, " \t\r\n\xef\xbb\xbf")] == '{' &&
+           (strstr(s->head, "\"views\"") || strstr(s->head, "\"featuresFolders\"") ||
+            strstr(s->head, "\"intrinsics\""));
+}
+
+// COLMAP comes first: in a folder, its files win over sidecars lying beside them.
+static const struct cameras_format formats[] = {
+    { "COLMAP", cameras_colmap_probe, cameras_colmap_read },
+    { "Bundler bundle.out", is_bundler, NULL },
+    { "Agisoft Metashape cameras XML", is_metashape, NULL },
+    { "RealityCapture XMP", is_reality_capture, NULL },
+    { "Meshroom (AliceVision SfMData JSON)", is_meshroom, NULL },
+};
+
+int cameras_read(struct cameras *out, const char *path)
+{
+    char head[4096] = "";
+    struct stat st;
+    struct cameras_source s = { .path = path, .head = head };
+    memset(out, 0, sizeof(*out));
+    FILE *f = NULL;
+    int err = stat(path, &st) ? -errno : 0;
+    s.is_folder = !err && S_ISDIR(st.st_mode);
+    if (!err && !s.is_folder) {
+        f = S_ISREG(st.st_mode) ? fopen(path, "rbe") : NULL;
+        err = f ? 0 : S_ISREG(st.st_mode) ? -errno : -EINVAL;
+    }
+    if (err) {
+        log_error("cameras: cannot open %s: %s", path, strerror(-err));
+        return err;
+    }
+    if (f) {
+        s.n_head = fread(head, 1, sizeof(head) - 1, f);
+        head[s.n_head] = 0;
+        fclose(f);
+    }
+    for (size_t i = 0; i < sizeof(formats) / sizeof(formats[0]); i++) {
+        if (!formats[i].probe(&s))
+            continue;
+        if (formats[i].read)
+            return formats[i].read(out, &s);
+        log_error("cameras: %s: this is %s, which is not read yet; export the cameras in COLMAP format "
+                  "(cameras.txt and images.txt)", path, formats[i].name);
+        return -ENOTSUP;
+    }
+    if (s.is_folder)
+        log_error("cameras: %s: no cameras in this folder; expected COLMAP's cameras.bin and images.bin, or cameras.txt and "
+                  "images.txt", path);
+    else
+        log_error("cameras: %s: not a known camera file; expected a folder with COLMAP's cameras and images, .bin or "
+                  ".txt", path);
+    return -EINVAL;
+}

@@ -1,0 +1,11 @@
+// solver/mesh_import.h - private to mesh.c, mesh_import.c and their fuzzer.
+#pragma once
+#include "solver/mesh.h"
+#include <stddef.h>
+#include <stdint.h>
+
+// ids[i] = number of item i (n_words 32-bit words, compared bit by bit) among the distinct ones, in order of first appearance.
+// n <= 2^31. Returns how many there are, or -ENOMEM.
+int64_t mesh_number_distinct(uint32_t *ids, const void *items, size_t n_words, size_t n);
+
+bool mesh_triangle_has_area(const struct mesh *mesh, int triangle); // in 3-D
