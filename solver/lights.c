@@ -1,6 +1,8 @@
-// solver/lights.c - cutting a panorama into lights, their irradiance at a point with derivatives, and lights.json.
+// solver/lights.c - cutting a panorama into lights, their irradiance at a point with derivatives,
+// and lights.json.
 //
-// Letters (paper, Eqs. 1-4): dh probe direction, C irradiance, c centre, R world_from_probe, q = 1/r.
+// Letters (paper, Eqs. 1-4): dh probe direction, C irradiance, c centre, R world_from_probe, q =
+// 1/r.
 #include "solver/lights.h"
 #include "solver/take/log.h"
 #include "solver/vec3.h"
@@ -12,7 +14,8 @@
 #include <stdlib.h>
 #include <string.h>
 
-// ---- memory -------------------------------------------------------------------------------------------------------------
+// ---- memory
+// -------------------------------------------------------------------------------------------------------------
 
 int lights_new(struct lights *out, int n)
 {
@@ -23,7 +26,7 @@ int lights_new(struct lights *out, int n)
         .irradiance = calloc((size_t)n, sizeof(*l.irradiance)),
         .inverse_distance = calloc((size_t)n, sizeof(*l.inverse_distance)),
         .group = malloc((size_t)n * sizeof(*l.group)),
-        .world_from_probe = { 1, 0, 0, 0, 1, 0, 0, 0, 1 },
+        .world_from_probe = {1, 0, 0, 0, 1, 0, 0, 0, 1},
     };
     memset(out, 0, sizeof(*out));
     if (!l.dir_probe || !l.irradiance || !l.inverse_distance || !l.group) {
@@ -49,19 +52,20 @@ void lights_free(struct lights *l)
     memset(l, 0, sizeof(*l));
 }
 
-// ---- one light at one point (Eqs. 1-4) ----------------------------------------------------------------------------------
+// ---- one light at one point (Eqs. 1-4)
+// ----------------------------------------------------------------------------------
 //
 //   a = R dh,  u = a + q (c - p),  s = |u|,  l = u / s,  weight = max(<u, a>, 0) / s^3
 //
-// With r = 1/q this is l = (l_p - p)/|l_p - p| and weight = r^2/|l_p - p|^2 max(<l, l_d>, 0), for l_p - p = r u.
-// A light emits into the half space in front of it: behind it the weight is 0. The point at the light itself (s below
-// rounding) has no direction; it gets l = a and weight 0.
+// With r = 1/q this is l = (l_p - p)/|l_p - p| and weight = r^2/|l_p - p|^2 max(<l, l_d>, 0), for
+// l_p - p = r u. A light emits into the half space in front of it: behind it the weight is 0. The
+// point at the light itself (s below rounding) has no direction; it gets l = a and weight 0.
 
 static const double s_min = 1e-12;
 
 // Returns false where the weight, and with it every derivative, is 0.
-static bool light_vector(const struct lights *l, int i, const double p[3], double a[3], double u[3], double *s,
-                         struct light_at *at)
+static bool light_vector(const struct lights *l, int i, const double p[3], double a[3], double u[3],
+                         double *s, struct light_at *at)
 {
     const double q = l->inverse_distance[i];
     mat3_mul_vec(a, l->world_from_probe, l->dir_probe[i]);
@@ -90,7 +94,8 @@ void light_at_point(const struct lights *l, int i, const double point_m[3], stru
 
 // By the chain rule over u and a, with m = <u, a>:
 //   dl/du = (I - l l^T)/s,  dweight/du = a/s^3 - 3 m u/s^5,  dweight/da = u/s^3
-//   du/dc = q I,  du/dp = -q I,  du/dq = c - p,  da/dw = du/dw = -[a]x  (R = exp([w]x) R0, so a moves by w x a)
+//   du/dc = q I,  du/dp = -q I,  du/dq = c - p,  da/dw = du/dw = -[a]x  (R = exp([w]x) R0, so a
+//   moves by w x a)
 void light_at_point_gradient(const struct lights *l, int i, const double point_m[3],
                              struct light_at_gradient *out)
 {
@@ -99,7 +104,7 @@ void light_at_point_gradient(const struct lights *l, int i, const double point_m
     if (!light_vector(l, i, point_m, a, u, &s, &out->at))
         return;
     const double q = l->inverse_distance[i], s3 = s * s * s, m = vec3_dot(u, a);
-    const double minus_a_cross[9] = { 0, a[2], -a[1], -a[2], 0, a[0], a[1], -a[0], 0 };
+    const double minus_a_cross[9] = {0, a[2], -a[1], -a[2], 0, a[0], a[1], -a[0], 0};
     double l_u[9], weight_u[3], weight_ua[3], c_minus_p[3];
     vec3_sub(c_minus_p, l->centre_m, point_m);
     for (int j = 0; j < 3; j++) {
@@ -122,14 +127,15 @@ void light_at_point_gradient(const struct lights *l, int i, const double point_m
     out->weight_inverse_distance = vec3_dot(weight_u, c_minus_p);
 }
 
-// ---- median cut ---------------------------------------------------------------------------------------------------------
+// ---- median cut
+// ---------------------------------------------------------------------------------------------------------
 
 struct cutter {
     const struct panorama *p;
     int width, height;
-    double *sin_lon, *cos_lon;        // [width] of pixel centres
+    double *sin_lon, *cos_lon;         // [width] of pixel centres
     double *sin_lat, *cos_lat, *omega; // [height]; omega: solid angle of the row's pixels
-    double *along;                    // [max(width, height)] energy of each column or row of one region
+    double *along; // [max(width, height)] energy of each column or row of one region
     struct lights *out;
 };
 
@@ -144,8 +150,9 @@ static const float *pixel_at(const struct cutter *k, int x, int y)
     return k->p->image.data + 3 * ((int64_t)y * k->width + x);
 }
 
-// Energy per column (by_columns) or row of the region into k->along. Summed from the pixels themselves, so that a region of no
-// energy is exactly 0; differences of one table over the whole panorama would leave its rounding there.
+// Energy per column (by_columns) or row of the region into k->along. Summed from the pixels
+// themselves, so that a region of no energy is exactly 0; differences of one table over the whole
+// panorama would leave its rounding there.
 static double sum_along(const struct cutter *k, const struct light_region *r, bool by_columns)
 {
     double total = 0;
@@ -165,8 +172,8 @@ static double sum_along(const struct cutter *k, const struct light_region *r, bo
     return total;
 }
 
-// Where energies along[0..n) are best halved: in [1, n-1]. Of equally good places the one nearest the middle, so that lone
-// bright pixels on black are found in log2 steps.
+// Where energies along[0..n) are best halved: in [1, n-1]. Of equally good places the one nearest
+// the middle, so that lone bright pixels on black are found in log2 steps.
 static int halving_place(const double *along, int n, double total)
 {
     double before = 0, best = INFINITY;
@@ -198,9 +205,10 @@ static bool split(const struct cutter *k, const struct light_region *r, struct l
     return true;
 }
 
-static double angle_between(const double a[3], const double b[3]) // of unit vectors; exact for small angles
+static double angle_between(const double a[3],
+                            const double b[3]) // of unit vectors; exact for small angles
 {
-    const double d[3] = { a[0] - b[0], a[1] - b[1], a[2] - b[2] };
+    const double d[3] = {a[0] - b[0], a[1] - b[1], a[2] - b[2]};
     return 2 * asin(fmin(vec3_norm(d) / 2, 1));
 }
 
@@ -208,10 +216,10 @@ static double angle_between(const double a[3], const double b[3]) // of unit vec
 static void measure(const struct cutter *k, int i, const struct light_region *r)
 {
     double *irradiance = k->out->irradiance[i], *dir = k->out->dir_probe[i];
-    double toward[3] = { 0, 0, 0 }, energy = 0; // sum of energy x direction, and of energy
+    double toward[3] = {0, 0, 0}, energy = 0; // sum of energy x direction, and of energy
     k->out->region[i] = *r;
     for (int y = r->y0; y < r->y1; y++) {
-        double row_rgb[3] = { 0, 0, 0 }, row_x = 0, row_z = 0, row = 0;
+        double row_rgb[3] = {0, 0, 0}, row_x = 0, row_z = 0, row = 0;
         for (int x = r->x0; x < r->x1; x++) {
             const float *rgb = pixel_at(k, x, y);
             const double lum = luminance(rgb);
@@ -238,7 +246,8 @@ static void measure(const struct cutter *k, int i, const struct light_region *r)
             const double lum = luminance(pixel_at(k, x, y));
             if (lum <= 0)
                 continue;
-            const double d[3] = { k->sin_lon[x] * k->cos_lat[y], k->sin_lat[y], k->cos_lon[x] * k->cos_lat[y] };
+            const double d[3] = {k->sin_lon[x] * k->cos_lat[y], k->sin_lat[y],
+                                 k->cos_lon[x] * k->cos_lat[y]};
             const double angle = angle_between(d, dir);
             row += lum * angle * angle;
         }
@@ -258,7 +267,7 @@ static void cut(const struct cutter *k, const struct light_region *r, int first,
     }
     measure(k, first, r);
     for (int i = first + 1; i < first + n; i++) { // could not be split: the others are empty
-        k->out->region[i] = (struct light_region){ r->x0, r->y0, r->x0, r->y0 };
+        k->out->region[i] = (struct light_region){r->x0, r->y0, r->x0, r->y0};
         memcpy(k->out->dir_probe[i], k->out->dir_probe[first], sizeof(k->out->dir_probe[i]));
     }
 }
@@ -266,14 +275,17 @@ static void cut(const struct cutter *k, const struct light_region *r, int first,
 int lights_median_cut(struct lights *out, const struct panorama *p, int n)
 {
     const int width = p->image.width, height = p->image.height;
-    struct lights l = { 0 };
+    struct lights l = {0};
     memset(out, 0, sizeof(*out));
     if (n < 1 || n > LIGHTS_MAX || (n & (n - 1))) {
-        log_error("lights: cannot cut a panorama into %d lights: expected a power of two from 1 to %d", n, LIGHTS_MAX);
+        log_error(
+            "lights: cannot cut a panorama into %d lights: expected a power of two from 1 to %d", n,
+            LIGHTS_MAX);
         return -EINVAL;
     }
     int err = lights_new(&l, n);
-    double *tables = malloc(((size_t)width * 3 + (size_t)height * 3) * sizeof(double)); // along: max(width, height) = width
+    double *tables = malloc(((size_t)width * 3 + (size_t)height * 3) *
+                            sizeof(double)); // along: max(width, height) = width
     if (err || !tables)
         goto no_memory;
     l.region = calloc((size_t)n, sizeof(*l.region));
@@ -282,9 +294,15 @@ int lights_median_cut(struct lights *out, const struct panorama *p, int n)
         goto no_memory;
     l.panorama_width_px = width, l.panorama_height_px = height;
     const struct cutter k = {
-        .p = p, .width = width, .height = height, .out = &l,
-        .sin_lon = tables, .cos_lon = tables + width, .along = tables + 2 * (size_t)width,
-        .sin_lat = tables + 3 * (size_t)width, .cos_lat = tables + 3 * (size_t)width + height,
+        .p = p,
+        .width = width,
+        .height = height,
+        .out = &l,
+        .sin_lon = tables,
+        .cos_lon = tables + width,
+        .along = tables + 2 * (size_t)width,
+        .sin_lat = tables + 3 * (size_t)width,
+        .cos_lat = tables + 3 * (size_t)width + height,
         .omega = tables + 3 * (size_t)width + 2 * (size_t)height,
     };
     for (int x = 0; x < width; x++) {
@@ -296,7 +314,7 @@ int lights_median_cut(struct lights *out, const struct panorama *p, int n)
         k.sin_lat[y] = sin(lat), k.cos_lat[y] = cos(lat);
         k.omega[y] = panorama_solid_angle(width, height, y);
     }
-    cut(&k, &(struct light_region){ 0, 0, width, height }, 0, n);
+    cut(&k, &(struct light_region){0, 0, width, height}, 0, n);
     free(tables);
     *out = l;
     return 0;
@@ -306,7 +324,8 @@ no_memory:
     return -ENOMEM;
 }
 
-// ---- lights.json --------------------------------------------------------------------------------------------------------
+// ---- lights.json
+// --------------------------------------------------------------------------------------------------------
 
 static const char format_name[] = "studiorig-lights-1";
 
@@ -334,7 +353,7 @@ static struct json *light_to_json(const struct lights *l, int i)
     json_set_int(v, "group", l->group[i]);
     if (l->region) {
         const struct light_region *r = &l->region[i];
-        json_set_numbers(v, "region", (double[]){ r->x0, r->y0, r->x1, r->y1 }, 4);
+        json_set_numbers(v, "region", (double[]){r->x0, r->y0, r->x1, r->y1}, 4);
     }
     if (l->spread_rad)
         json_set_number(v, "spread_rad", l->spread_rad[i]);
@@ -398,9 +417,11 @@ static int read_place(struct lights *l, const struct json *doc, const char *file
     for (int i = 0; i < 3; i++)
         for (int j = i; j < 3; j++)
             if (!(fabs(vec3_dot(R + 3 * i, R + 3 * j) - (i == j)) <= 1e-6))
-                return refuse(file, "world_from_probe", "is not a rotation: its rows are not orthonormal to 1e-6");
+                return refuse(file, "world_from_probe",
+                              "is not a rotation: its rows are not orthonormal to 1e-6");
     if (mat3_det(R) < 0)
-        return refuse(file, "world_from_probe", "is mirrored (determinant -1): expected a rotation; mirror the panorama, "
+        return refuse(file, "world_from_probe",
+                      "is mirrored (determinant -1): expected a rotation; mirror the panorama, "
                       "not the rotation");
     return 0;
 }
@@ -410,9 +431,11 @@ static int read_panorama_size(struct lights *l, const struct json *doc, const ch
     int64_t width = 0, height = 0;
     if (!json_get(doc, "panorama") || is_null(doc, "panorama"))
         return 0;
-    if (json_get_int(doc, "panorama.width", &width) || json_get_int(doc, "panorama.height", &height) ||
-        width < 0 || width > 65536 || width != 2 * height)
-        return refuse(file, "panorama", "must have integers width = 2 x height, at most 65536 (or 0: no panorama)");
+    if (json_get_int(doc, "panorama.width", &width) ||
+        json_get_int(doc, "panorama.height", &height) || width < 0 || width > 65536 ||
+        width != 2 * height)
+        return refuse(file, "panorama",
+                      "must have integers width = 2 x height, at most 65536 (or 0: no panorama)");
     l->panorama_width_px = (int)width, l->panorama_height_px = (int)height;
     return 0;
 }
@@ -428,10 +451,12 @@ static int read_distance(struct lights *l, int i, const struct json *doc, const 
     if (err)
         return err;
     if (!(distance_m >= distance_min_m))
-        return refuse(file, key, "is below 1e-6 m: expected metres, or null for a directional light");
+        return refuse(file, key,
+                      "is below 1e-6 m: expected metres, or null for a directional light");
     l->inverse_distance[i] = 1 / distance_m;
 
-    light_key(key, i, "pos_m"); // says again what centre, rotation, direction and distance say: an edit must be of both
+    light_key(key, i, "pos_m"); // says again what centre, rotation, direction and distance say: an
+                                // edit must be of both
     if (!json_get(doc, key) || is_null(doc, key))
         return 0;
     const int pos_err = json_require_numbers(doc, key, pos_m, 3, file);
@@ -440,7 +465,9 @@ static int read_distance(struct lights *l, int i, const struct json *doc, const 
     light_position(l, i, expected);
     vec3_sub(pos_m, pos_m, expected);
     if (!(vec3_norm(pos_m) <= 1e-5 * (distance_m + vec3_norm(l->centre_m) + 1)))
-        return refuse(file, key, "is not centre_m + distance_m x world_from_probe x dir_probe: correct it, or leave it out");
+        return refuse(file, key,
+                      "is not centre_m + distance_m x world_from_probe x dir_probe: correct it, or "
+                      "leave it out");
     return 0;
 }
 
@@ -469,24 +496,31 @@ static int read_light(struct lights *l, int i, const struct json *doc, const cha
 
     int64_t group = -1;
     light_key(key, i, "group");
-    if (json_get(doc, key) && !is_null(doc, key) && (json_get_int(doc, key, &group) || group < -1 || group >= l->n))
-        return refuse(file, key, "must be the number of an emitter (0 .. lights - 1), or -1 for none");
+    if (json_get(doc, key) && !is_null(doc, key) &&
+        (json_get_int(doc, key, &group) || group < -1 || group >= l->n))
+        return refuse(file, key,
+                      "must be the number of an emitter (0 .. lights - 1), or -1 for none");
     l->group[i] = (int32_t)group;
 
     if (l->region) {
         double edge[4]; // x0, y0, x1, y1
-        const double limit[4] = { l->panorama_width_px, l->panorama_height_px, l->panorama_width_px,
-                                  l->panorama_height_px };
+        const double limit[4] = {l->panorama_width_px, l->panorama_height_px, l->panorama_width_px,
+                                 l->panorama_height_px};
         err = json_require_numbers(doc, light_key(key, i, "region"), edge, 4, file);
         if (err)
             return err;
         for (int k = 0; k < 4; k++)
-            if (!(edge[k] >= 0 && edge[k] <= limit[k] && edge[k] == floor(edge[k])) || edge[k] < edge[k % 2])
-                return refuse(file, key, "must be pixels x0, y0, x1, y1 inside the panorama, x0 <= x1, y0 <= y1");
-        l->region[i] = (struct light_region){ (int)edge[0], (int)edge[1], (int)edge[2], (int)edge[3] };
+            if (!(edge[k] >= 0 && edge[k] <= limit[k] && edge[k] == floor(edge[k])) ||
+                edge[k] < edge[k % 2])
+                return refuse(
+                    file, key,
+                    "must be pixels x0, y0, x1, y1 inside the panorama, x0 <= x1, y0 <= y1");
+        l->region[i] =
+            (struct light_region){(int)edge[0], (int)edge[1], (int)edge[2], (int)edge[3]};
     }
     if (l->spread_rad) {
-        err = json_require_numbers(doc, light_key(key, i, "spread_rad"), &l->spread_rad[i], 1, file);
+        err =
+            json_require_numbers(doc, light_key(key, i, "spread_rad"), &l->spread_rad[i], 1, file);
         if (err)
             return err;
         if (!(l->spread_rad[i] >= 0 && l->spread_rad[i] <= M_PI))
@@ -505,8 +539,11 @@ static int from_json(struct lights *out, const struct json *doc, const char *fil
         return refuse(file, "format", "is not \"studiorig-lights-1\"");
     const int n = json_length(doc, "lights");
     if (n < 1 || n > LIGHTS_MAX) {
-        log_error("lights: %s: lights: expected a list of 1 to %d lights, found %s", file, LIGHTS_MAX,
-                  n > 0 ? "more" : n == 0 ? "none" : "no list");
+        log_error("lights: %s: lights: expected a list of 1 to %d lights, found %s", file,
+                  LIGHTS_MAX,
+                  n > 0    ? "more"
+                  : n == 0 ? "none"
+                           : "no list");
         return -EINVAL;
     }
     struct lights l;
@@ -517,7 +554,8 @@ static int from_json(struct lights *out, const struct json *doc, const char *fil
         l.region = calloc((size_t)n, sizeof(*l.region));
     if (json_get(doc, "lights.0.spread_rad"))
         l.spread_rad = calloc((size_t)n, sizeof(*l.spread_rad));
-    if ((json_get(doc, "lights.0.region") && !l.region) || (json_get(doc, "lights.0.spread_rad") && !l.spread_rad)) {
+    if ((json_get(doc, "lights.0.region") && !l.region) ||
+        (json_get(doc, "lights.0.spread_rad") && !l.spread_rad)) {
         err = -ENOMEM;
         goto fail;
     }
@@ -535,7 +573,8 @@ fail:
     return err;
 }
 
-int lights_parse_json(struct lights *out, const char *text, size_t n_bytes, const char *name_for_errors)
+int lights_parse_json(struct lights *out, const char *text, size_t n_bytes,
+                      const char *name_for_errors)
 {
     struct json *doc;
     memset(out, 0, sizeof(*out));

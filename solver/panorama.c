@@ -1,7 +1,8 @@
-// solver/panorama.c - reading a panorama, and what each of its pixels means: direction, solid angle, energy.
+// solver/panorama.c - reading a panorama, and what each of its pixels means: direction, solid
+// angle, energy.
 //
-// Everything that follows is a sum of radiance x solid angle, so the solid angle is the exact one of the pixel's
-// latitude band: a constant panorama sums to 4 pi whatever its size.
+// Everything that follows is a sum of radiance x solid angle, so the solid angle is the exact one
+// of the pixel's latitude band: a constant panorama sums to 4 pi whatever its size.
 #include "solver/panorama.h"
 #include "solver/take/log.h"
 #include "solver/vec3.h"
@@ -11,7 +12,7 @@
 #include <stdlib.h>
 #include <string.h>
 
-static const char *const rgb[] = { "R", "G", "B", NULL };
+static const char *const rgb[] = {"R", "G", "B", NULL};
 
 // Keep R, G, B of a picture that may have more (A, depth, layers).
 static int keep_rgb(struct image *image, const char *path)
@@ -21,8 +22,9 @@ static int keep_rgb(struct image *image, const char *path)
         from[c] = image_channel(image, rgb[c]);
         if (from[c] >= 0)
             continue;
-        log_error("panorama: %s: no channel %s (its first is %s): a panorama needs R, G and B; save it as RGB", path,
-                  rgb[c], image->names[0]);
+        log_error("panorama: %s: no channel %s (its first is %s): a panorama needs R, G and B; "
+                  "save it as RGB",
+                  path, rgb[c], image->names[0]);
         return -EINVAL;
     }
     if (image->n_channels == 3 && from[0] == 0 && from[1] == 1 && from[2] == 2)
@@ -60,26 +62,29 @@ static int clear_negatives(struct image *image, const char *path)
     }
     const int x = (int)(first / 3 % image->width), y = (int)(first / 3 / image->width);
     if (n_negative)
-        log_warning("panorama: %s: %" PRId64 " negative values set to 0 (first at pixel %d,%d; lowest %g)", path,
-                    n_negative, x, y, (double)lowest);
+        log_warning("panorama: %s: %" PRId64
+                    " negative values set to 0 (first at pixel %d,%d; lowest %g)",
+                    path, n_negative, x, y, (double)lowest);
     if (highest > 0)
         return 0;
-    log_error("panorama: %s: all %dx%d pixels are black: there is no light to cut; was the right bracket merged?", path,
-              image->width, image->height);
+    log_error("panorama: %s: all %dx%d pixels are black: there is no light to cut; was the right "
+              "bracket merged?",
+              path, image->width, image->height);
     return -EINVAL;
 }
 
 int panorama_read(struct panorama *out, const char *path)
 {
-    struct image image = { 0 };
+    struct image image = {0};
     memset(out, 0, sizeof(*out));
     int err = image_read(&image, path);
     if (err)
         return err;
     if (image.width != 2 * image.height) {
-        log_error("panorama: %s: is %dx%d, but a latitude-longitude panorama is twice as wide as high (%dx%d): "
-                  "pad or crop it to the whole sphere",
-                  path, image.width, image.height, 2 * image.height, image.height);
+        log_error(
+            "panorama: %s: %dx%d is not 2:1: a latitude-longitude picture of the whole sphere is "
+            "twice as wide as high (%dx%d): pad or crop it",
+            path, image.width, image.height, 2 * image.height, image.height);
         err = -EINVAL;
         goto fail;
     }
@@ -125,11 +130,12 @@ double panorama_solid_angle(int width, int height, int y)
     return 4 * M_PI / width * sin(M_PI * (y + .5) / height) * sin(M_PI / (2 * height));
 }
 
-void panorama_irradiance(const struct panorama *p, const double normal_probe[3], double irradiance[3])
+void panorama_irradiance(const struct panorama *p, const double normal_probe[3],
+                         double irradiance[3])
 {
     enum { BLOCK = 256 }; // columns whose longitude is worked out once
     const int width = p->image.width, height = p->image.height;
-    double sum[3] = { 0, 0, 0 };
+    double sum[3] = {0, 0, 0};
     for (int x0 = 0; x0 < width; x0 += BLOCK) {
         const int n = width - x0 < BLOCK ? width - x0 : BLOCK;
         double across[BLOCK]; // the horizontal part of <n, d>, before cos(lat)
@@ -141,7 +147,7 @@ void panorama_irradiance(const struct panorama *p, const double normal_probe[3],
             const float *pixel = p->image.data + 3 * ((int64_t)y * width + x0);
             const double lat = M_PI / 2 - M_PI * (y + .5) / height;
             const double up = normal_probe[1] * sin(lat), level = cos(lat);
-            double row[3] = { 0, 0, 0 };
+            double row[3] = {0, 0, 0};
             for (int i = 0; i < n; i++) {
                 const double cosine = up + level * across[i];
                 if (cosine > 0)
@@ -159,10 +165,10 @@ void panorama_irradiance(const struct panorama *p, const double normal_probe[3],
 void panorama_total(const struct panorama *p, double total[3])
 {
     const int width = p->image.width, height = p->image.height;
-    double sum[3] = { 0, 0, 0 };
+    double sum[3] = {0, 0, 0};
     for (int y = 0; y < height; y++) {
         const float *pixel = p->image.data + 3 * (int64_t)y * width;
-        double row[3] = { 0, 0, 0 };
+        double row[3] = {0, 0, 0};
         for (int x = 0; x < width; x++)
             for (int c = 0; c < 3; c++)
                 row[c] += pixel[3 * x + c];

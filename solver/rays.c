@@ -65,7 +65,7 @@ static int attach(struct rays *r, const struct mesh *mesh)
 static void *copy_of(const void *from, size_t n_bytes)
 {
     void *to = malloc(n_bytes ? n_bytes : 1);
-    if (to)
+    if (to && n_bytes)
         memcpy(to, from, n_bytes);
     return to;
 }

@@ -70,8 +70,9 @@ int lit_new(struct lit *out, int n_lights)
         return -ENOMEM;
     // One vector more than the lights: compaction stores whole vectors.
     struct lit l = { .capacity = padded(n_lights) + KERNEL_WIDTH };
-    float **const arrays[] = { &l.lx, &l.ly, &l.nl, &l.sl, &l.gc, &l.wr, &l.wg, &l.wb };
-    const int err = new_arrays(arrays, 8, l.capacity);
+    float **const arrays[] = { &l.lx, &l.ly, &l.nl, &l.sl, &l.gc, &l.wr, &l.wg, &l.wb,
+                               &l.lx_rest, &l.ly_rest };
+    const int err = new_arrays(arrays, 10, l.capacity);
     if (err)
         return err;
     *out = l;

@@ -31,6 +31,7 @@ struct surface_point {
 struct lit {
     int n, capacity;
     float *lx, *ly, *nl, *sl /* S(nl) = (1-nl)^5 */, *gc /* clearcoat's g1(nl, .25) */, *wr, *wg, *wb;
+    float *lx_rest, *ly_rest; // what float left of lx, ly: sharp lobes need it
 };
 int lit_new(struct lit *out, int n_lights); // 0 or -ENOMEM
 void lit_free(struct lit *l);

@@ -5,6 +5,7 @@
 #include <immintrin.h>
 
 typedef __m256 vf;
+typedef __m256d vd;
 typedef unsigned v_mask; // one bit per lane
 enum { LANES = 8 };
 #define V static inline __attribute__((always_inline))
@@ -32,6 +33,26 @@ V vf v_fnma(vf a, vf b, vf c)
 V vf v_max(vf a, vf b)
 {
     return _mm256_max_ps(a, b);
+}
+V vd d_set1(double x)
+{
+    return _mm256_set1_pd(x);
+}
+V vd d_fma(vd a, vd b, vd c)
+{
+    return _mm256_fmadd_pd(a, b, c);
+}
+V vd d_fnma(vd a, vd b, vd c)
+{
+    return _mm256_fnmadd_pd(a, b, c);
+}
+V vd d_wide(vf x, int half)
+{
+    return _mm256_cvtps_pd(half ? _mm256_extractf128_ps(x, 1) : _mm256_castps256_ps128(x));
+}
+V vf d_narrow(vd low, vd high)
+{
+    return _mm256_set_m128(_mm256_cvtpd_ps(high), _mm256_cvtpd_ps(low));
 }
 // 12 bits and one Newton step: 1e-7.
 V vf v_rcp(vf x)

@@ -5,6 +5,7 @@
 #include <immintrin.h>
 
 typedef __m512 vf;
+typedef __m512d vd;
 typedef __mmask16 v_mask;
 enum { LANES = 16 };
 #define V static inline __attribute__((always_inline))
@@ -32,6 +33,26 @@ V vf v_fnma(vf a, vf b, vf c)
 V vf v_max(vf a, vf b)
 {
     return _mm512_max_ps(a, b);
+}
+V vd d_set1(double x)
+{
+    return _mm512_set1_pd(x);
+}
+V vd d_fma(vd a, vd b, vd c)
+{
+    return _mm512_fmadd_pd(a, b, c);
+}
+V vd d_fnma(vd a, vd b, vd c)
+{
+    return _mm512_fnmadd_pd(a, b, c);
+}
+V vd d_wide(vf x, int half)
+{
+    return _mm512_cvtps_pd(half ? _mm512_extractf32x8_ps(x, 1) : _mm512_castps512_ps256(x));
+}
+V vf d_narrow(vd low, vd high)
+{
+    return _mm512_insertf32x8(_mm512_castps256_ps512(_mm512_cvtpd_ps(low)), _mm512_cvtpd_ps(high), 1);
 }
 // 14 bits and one Newton step: 1e-7.
 V vf v_rcp(vf x)

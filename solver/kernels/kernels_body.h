@@ -1,6 +1,7 @@
 // solver/kernels/kernels_body.h - the float kernels, written once over a vector type; each instruction set's file defines
-//   vf, LANES (2^k <= KERNEL_WIDTH), and v_set1 v_load v_store v_fma(a,b,c)=ab+c v_fnma=c-ab v_max v_rcp v_rsqrt_sqrt
-//   keep_positive(w, bits) and compress(p, x, mask)
+//   vf, LANES floats (LANES divides KERNEL_WIDTH), and vd, half as many doubles;
+//   v_set1 v_load v_store v_max v_fma(a,b,c) = ab+c, v_fnma = c-ab, v_rcp, v_rsqrt_sqrt (returns 1/sqrt, stores sqrt);
+//   v_mask: v_positive(x, bits) v_count v_compress; v_keep v_bytes add_up; d_set1 d_fma d_fnma d_wide(x, half) d_narrow(a, b)
 // and includes this file.
 //
 // Light and view directions are in the surface's own frame (x, y, n), where the horizon is a sign and alpha is diagonal.
@@ -10,6 +11,10 @@
 // d ln(GD)/dr = const + [sx^2 dx + sy^2 dy]/P - gl/root_l [lx^2 ex + ly^2 ey], and the same by anisotropic. The isotropic G of
 // 2012 is the same expression with both of G's alphas equal, as |l| = 1; so one loop serves both variants.
 //
+// Sharp lobes: where l + v nearly cancels in x or y, float's rounding of l itself (6e-8) is not small beside alpha; the error of D
+// grows like 1e-8 / alpha^3. So directions are gathered in double and kept as float + float, and when an alpha is below SHARP both
+// parts are added; above, the first part is enough.
+//
 // 27 sums per sample carry everything (SOLVER.md 6): Fd, ss, FH, GD(1-FH), GD FH, coat, by roughness, by anisotropic, by gloss,
 // each x RGB. Sums are taken in blocks of BLOCK lights in float and added up in double, so that thousands of lights cost no digits.
 #include "solver/kernels/kernels.h"
@@ -17,11 +22,14 @@
 #include <math.h>
 
 enum { BLOCK = 1024 };
+#define SHARP .1f
 enum { FD, SS, FH, GDN, GDF, COAT, BY_ROUGHNESS, BY_ANISOTROPIC, BY_GLOSS, N_SUMS };
 #define INLINE static inline __attribute__((always_inline))
 
 struct constants {
     float vx, vy, nv, sv;           // view in the surface's frame, S(nv)
+    float vx_rest, vy_rest;         // what float left of vx, vy
+    bool sharp;
     float r4;                       // roughness / 4: F = r lh^2 = r4 |s|^2
     float ix2, iy2, gx2, gy2;       // 1/alpha^2 of D, alpha^2 of G
     float rx, ry, r0, gr_x, gr_y;   // d ln(GD) by roughness
@@ -43,6 +51,15 @@ static float dot3(const float a[3], const float b[3])
     return a[0] * b[0] + a[1] * b[1] + a[2] * b[2];
 }
 
+// <a,b> as float + float.
+static float split(const float a[3], const float b[3], float *rest)
+{
+    const double exact = (double)a[0] * (double)b[0] + (double)a[1] * (double)b[1] + (double)a[2] * (double)b[2];
+    const float first = (float)exact;
+    *rest = (float)(exact - (double)first);
+    return first;
+}
+
 static float pow5(float x)
 {
     return x * x * (x * x) * x;
@@ -56,7 +73,7 @@ static bool find_constants(struct constants *k, struct material_terms *t, const 
     if (!(nv > 0))
         return false;
     k->nv = nv > 1e-10f ? nv : 1e-10f; // keeps |s|^2 and 1/(nl+nv) within float's range
-    k->vx = dot3(s->tangent, v), k->vy = dot3(s->bitangent, v);
+    k->vx = split(s->tangent, v, &k->vx_rest), k->vy = split(s->bitangent, v, &k->vy_rest);
     k->sv = pow5(nv < 1 ? 1 - nv : 0);
 
     const float *theta = m->theta;
@@ -70,6 +87,7 @@ static bool find_constants(struct constants *k, struct material_terms *t, const 
         ax = least, ax_r = 0, ax_an = 0;
     if (ay <= least)
         ay = least, ay_r = 0, ay_an = 0;
+    k->sharp = ax < SHARP || ay < SHARP;
     const float iax = 1 / ax, iay = 1 / ay;
     k->ix2 = iax * iax, k->iy2 = iay * iay;
     k->rx = 4 * k->ix2 * iax * ax_r, k->ry = 4 * k->iy2 * iay * ay_r;
@@ -117,6 +135,7 @@ static bool find_constants(struct constants *k, struct material_terms *t, const 
 // Lights that cannot be gathered any more: what depends on the light only.
 struct light_vector {
     vf lx, ly, nl, sl, gc, w[3]; // sl = S(nl); gc = clearcoat's g1(nl, .25); w = V nl c per channel
+    vf lx_rest, ly_rest;         // when sharp
 };
 
 INLINE vf v_schlick(vf u)
@@ -132,12 +151,21 @@ INLINE vf v_coat_g(vf nl)
     return v_rcp(nl + root);
 }
 
-// The value of f per light without its three channels: base, FH, GD(1-FH), GD FH, coat; see shade_terms.
-INLINE void shade_light(vf sum[3], const struct constants *k, const struct light_vector *l,
+// s = l + v
+INLINE void half_vector(vf *sx, vf *sy, vf *sz, const struct constants *k, const struct light_vector *l, bool sharp)
+{
+    *sx = l->lx + v_set1(k->vx), *sy = l->ly + v_set1(k->vy), *sz = l->nl + v_set1(k->nv);
+    if (sharp)
+        *sx += l->lx_rest + v_set1(k->vx_rest), *sy += l->ly_rest + v_set1(k->vy_rest);
+}
+
+// The value alone: base[c] is what the diffuse lobe is multiplied by, sheen[c] what FH is.
+INLINE void shade_light(vf sum[3], const struct constants *k, const struct light_vector *l, bool sharp,
                         const float base[3], const float sheen[3], bool subsurface, bool coat)
 {
     const vf one = v_set1(1);
-    const vf sx = l->lx + v_set1(k->vx), sy = l->ly + v_set1(k->vy), sz = l->nl + v_set1(k->nv);
+    vf sx, sy, sz;
+    half_vector(&sx, &sy, &sz, k, l, sharp);
     const vf x2 = sx * sx, y2 = sy * sy, z2 = sz * sz, xy2 = x2 + y2, s2 = xy2 + z2;
     vf s;
     v_rsqrt_sqrt(s2, &s);
@@ -169,10 +197,11 @@ INLINE void shade_light(vf sum[3], const struct constants *k, const struct light
     }
 }
 
-INLINE void jacobian_light(vf sum[N_SUMS][3], const struct constants *k, const struct light_vector *l)
+INLINE void jacobian_light(vf sum[N_SUMS][3], const struct constants *k, const struct light_vector *l, bool sharp)
 {
     const vf one = v_set1(1);
-    const vf sx = l->lx + v_set1(k->vx), sy = l->ly + v_set1(k->vy), sz = l->nl + v_set1(k->nv);
+    vf sx, sy, sz;
+    half_vector(&sx, &sy, &sz, k, l, sharp);
     const vf x2 = sx * sx, y2 = sy * sy, z2 = sz * sz, xy2 = x2 + y2, s2 = xy2 + z2;
     vf s;
     v_rsqrt_sqrt(s2, &s);
@@ -257,11 +286,28 @@ INLINE void clear_sums(vf sum[N_SUMS][3])
         sum[i][0] = sum[i][1] = sum[i][2] = v_set1(0);
 }
 
-INLINE void load_lit(struct light_vector *l, const struct lit *lit, int i)
+INLINE void load_lit(struct light_vector *l, const struct lit *lit, int i, bool sharp)
 {
     l->lx = v_load(lit->lx + i), l->ly = v_load(lit->ly + i), l->nl = v_load(lit->nl + i);
     l->sl = v_load(lit->sl + i), l->gc = v_load(lit->gc + i);
     l->w[0] = v_load(lit->wr + i), l->w[1] = v_load(lit->wg + i), l->w[2] = v_load(lit->wb + i);
+    if (sharp)
+        l->lx_rest = v_load(lit->lx_rest + i), l->ly_rest = v_load(lit->ly_rest + i);
+}
+
+INLINE void jacobian_all(double sums[N_SUMS][3], const struct lit *lit, const struct constants *k, bool sharp)
+{
+    for (int begin = 0; begin < lit->n; begin += BLOCK) {
+        const int end = lit->n - begin < BLOCK ? lit->n : begin + BLOCK;
+        vf sum[N_SUMS][3];
+        clear_sums(sum);
+        for (int i = begin; i < end; i += LANES) {
+            struct light_vector l;
+            load_lit(&l, lit, i, sharp);
+            jacobian_light(sum, k, &l, sharp);
+        }
+        add_up(&sum[0][0], N_SUMS * 3, &sums[0][0]);
+    }
 }
 
 static void shade_jacobian(struct shade_jacobian *out, const struct lit *lit, const struct surface_point *s,
@@ -273,21 +319,14 @@ static void shade_jacobian(struct shade_jacobian *out, const struct lit *lit, co
     if (!find_constants(&k, &t, s, v, m))
         return;
     double sums[N_SUMS][3] = { 0 };
-    for (int begin = 0; begin < lit->n; begin += BLOCK) {
-        const int end = lit->n - begin < BLOCK ? lit->n : begin + BLOCK;
-        vf sum[N_SUMS][3];
-        clear_sums(sum);
-        for (int i = begin; i < end; i += LANES) {
-            struct light_vector l;
-            load_lit(&l, lit, i);
-            jacobian_light(sum, &k, &l);
-        }
-        add_up(&sum[0][0], N_SUMS * 3, &sums[0][0]);
-    }
+    if (k.sharp)
+        jacobian_all(sums, lit, &k, true);
+    else
+        jacobian_all(sums, lit, &k, false);
     finish(out, sums, &k, &t, m);
 }
 
-INLINE void shade_all(double L[3], const struct lit *lit, const struct constants *k, const float base[3],
+INLINE void shade_all(double L[3], const struct lit *lit, const struct constants *k, bool sharp, const float base[3],
                       const float sheen[3], bool subsurface, bool coat)
 {
     for (int begin = 0; begin < lit->n; begin += BLOCK) {
@@ -295,8 +334,8 @@ INLINE void shade_all(double L[3], const struct lit *lit, const struct constants
         vf sum[3] = { v_set1(0), v_set1(0), v_set1(0) };
         for (int i = begin; i < end; i += LANES) {
             struct light_vector l;
-            load_lit(&l, lit, i);
-            shade_light(sum, k, &l, base, sheen, subsurface, coat);
+            load_lit(&l, lit, i, sharp);
+            shade_light(sum, k, &l, sharp, base, sheen, subsurface, coat);
         }
         add_up(sum, 3, L);
     }
@@ -319,45 +358,82 @@ static void shade(float L[3], const struct lit *lit, const struct surface_point 
     k.scale_coat *= m->theta[DISNEY_CLEARCOAT];
     const bool subsurface = m->theta[DISNEY_SUBSURFACE] > 0 && dielectric > 0, coat = m->theta[DISNEY_CLEARCOAT] > 0;
     double sums[3] = { 0 };
-    if (subsurface && coat)
-        shade_all(sums, lit, &k, base, sheen, true, true);
+    if (k.sharp)
+        shade_all(sums, lit, &k, true, base, sheen, true, true);
+    else if (subsurface && coat)
+        shade_all(sums, lit, &k, false, base, sheen, true, true);
     else if (subsurface)
-        shade_all(sums, lit, &k, base, sheen, true, false);
+        shade_all(sums, lit, &k, false, base, sheen, true, false);
     else if (coat)
-        shade_all(sums, lit, &k, base, sheen, false, true);
+        shade_all(sums, lit, &k, false, base, sheen, false, true);
     else
-        shade_all(sums, lit, &k, base, sheen, false, false);
+        shade_all(sums, lit, &k, false, base, sheen, false, false);
     for (int c = 0; c < 3; c++)
         L[c] = (float)sums[c];
 }
 
-// Eqs. 1-4 for LANES lights: direction in the surface's frame and max(<u,d>,0)/|u|^3, with u = d + q (centre - p).
+// Eqs. 1-4 for LANES lights: direction in the surface's frame and nl max(<u,d>,0)/|u|^3, with u = d + q (centre - p).
 struct incoming {
-    vf lx, ly, nl, weight;
+    vf lx, ly, nl, weight, lx_rest, ly_rest;
 };
 
-INLINE struct incoming light_at(const struct light_arrays *a, int i, const struct surface_point *s, const float o[3])
+// nl stays above 0 so that nothing divides by 0, whatever the weight.
+INLINE void weigh(struct incoming *in, vf ud, vf iu)
 {
-    const vf dx = v_load(a->dx + i), dy = v_load(a->dy + i), dz = v_load(a->dz + i), q = v_load(a->q + i);
-    const vf ux = v_fma(q, v_set1(o[0]), dx), uy = v_fma(q, v_set1(o[1]), dy), uz = v_fma(q, v_set1(o[2]), dz);
-    const vf u2 = v_max(v_fma(ux, ux, v_fma(uy, uy, uz * uz)), v_set1(1e-12f));
-    const vf ud = v_max(v_fma(ux, dx, v_fma(uy, dy, uz * dz)), v_set1(0));
+    in->weight = v_max(in->nl, v_set1(0)) * v_max(ud, v_set1(0)) * (iu * iu * iu);
+    in->nl = v_max(in->nl, v_set1(1e-10f));
+}
+
+INLINE struct incoming light_at(const struct light_arrays *a, int i, const struct surface_point *s)
+{
+    const vf q = v_load(a->q + i);
+    vf d[3], u[3];
+    for (int c = 0; c < 3; c++) {
+        d[c] = v_load((c == 0 ? a->dx : c == 1 ? a->dy : a->dz) + i);
+        u[c] = v_fma(q, v_set1(a->centre_m[c] - s->position_m[c]), d[c]);
+    }
     vf unused;
-    const vf iu = v_rsqrt_sqrt(u2, &unused);
-    struct incoming in;
+    const vf iu = v_rsqrt_sqrt(v_max(v_fma(u[0], u[0], v_fma(u[1], u[1], u[2] * u[2])), v_set1(1e-12f)), &unused);
     const float *const x = s->tangent, *const y = s->bitangent, *const n = s->normal;
-    in.lx = iu * v_fma(ux, v_set1(x[0]), v_fma(uy, v_set1(x[1]), uz * v_set1(x[2])));
-    in.ly = iu * v_fma(ux, v_set1(y[0]), v_fma(uy, v_set1(y[1]), uz * v_set1(y[2])));
-    in.nl = iu * v_fma(ux, v_set1(n[0]), v_fma(uy, v_set1(n[1]), uz * v_set1(n[2])));
-    in.weight = v_max(in.nl, v_set1(0)) * ud * (iu * iu * iu);
-    in.nl = v_max(in.nl, v_set1(1e-10f)); // so that nothing divides by 0, whatever the weight
+    struct incoming in;
+    in.lx = iu * v_fma(u[0], v_set1(x[0]), v_fma(u[1], v_set1(x[1]), u[2] * v_set1(x[2])));
+    in.ly = iu * v_fma(u[0], v_set1(y[0]), v_fma(u[1], v_set1(y[1]), u[2] * v_set1(y[2])));
+    in.nl = iu * v_fma(u[0], v_set1(n[0]), v_fma(u[1], v_set1(n[1]), u[2] * v_set1(n[2])));
+    weigh(&in, v_fma(u[0], d[0], v_fma(u[1], d[1], u[2] * d[2])), iu);
     return in;
 }
 
-static void from_point(float o[3], const struct light_arrays *a, const struct surface_point *s)
+// The same in double, half a vector at a time.
+INLINE struct incoming light_at_exact(const struct light_arrays *a, int i, const struct surface_point *s)
 {
-    for (int c = 0; c < 3; c++)
-        o[c] = a->centre_m[c] - s->position_m[c];
+    vd lx[2], ly[2], nl[2], ud[2], iu[2];
+    for (int half = 0; half < 2; half++) {
+        const vd q = d_wide(v_load(a->q + i), half);
+        vd d[3], u[3];
+        for (int c = 0; c < 3; c++) {
+            d[c] = d_wide(v_load((c == 0 ? a->dx : c == 1 ? a->dy : a->dz) + i), half);
+            u[c] = d_fma(q, d_set1((double)a->centre_m[c] - (double)s->position_m[c]), d[c]);
+        }
+        const vd u2 = d_fma(u[0], u[0], d_fma(u[1], u[1], u[2] * u[2]));
+        ud[half] = d_fma(u[0], d[0], d_fma(u[1], d[1], u[2] * d[2]));
+        iu[half] = u2;
+        const float *const x = s->tangent, *const y = s->bitangent, *const n = s->normal;
+        lx[half] = d_fma(u[0], d_set1((double)x[0]), d_fma(u[1], d_set1((double)x[1]), u[2] * d_set1((double)x[2])));
+        ly[half] = d_fma(u[0], d_set1((double)y[0]), d_fma(u[1], d_set1((double)y[1]), u[2] * d_set1((double)y[2])));
+        nl[half] = d_fma(u[0], d_set1((double)n[0]), d_fma(u[1], d_set1((double)n[1]), u[2] * d_set1((double)n[2])));
+    }
+    vf unused;
+    const vf start = v_rsqrt_sqrt(v_max(d_narrow(iu[0], iu[1]), v_set1(1e-12f)), &unused);
+    for (int half = 0; half < 2; half++) { // one Newton step takes 1e-7 to 1e-14
+        const vd y = d_wide(start, half), e = d_fnma(iu[half] * y, y, d_set1(1));
+        iu[half] = d_fma(y * d_set1(.5), e, y);
+        lx[half] *= iu[half], ly[half] *= iu[half], nl[half] *= iu[half];
+    }
+    struct incoming in = { .lx = d_narrow(lx[0], lx[1]), .ly = d_narrow(ly[0], ly[1]), .nl = d_narrow(nl[0], nl[1]) };
+    in.lx_rest = d_narrow(lx[0] - d_wide(in.lx, 0), lx[1] - d_wide(in.lx, 1));
+    in.ly_rest = d_narrow(ly[0] - d_wide(in.ly, 0), ly[1] - d_wide(in.ly, 1));
+    weigh(&in, d_narrow(ud[0], ud[1]), d_narrow(iu[0], iu[1]));
+    return in;
 }
 
 static unsigned visible_bits(const uint16_t *visible, int i)
@@ -368,16 +444,15 @@ static unsigned visible_bits(const uint16_t *visible, int i)
 static void gather(struct lit *out, const struct light_arrays *a, const struct surface_point *s,
                    const uint16_t *visible, const uint8_t *soft)
 {
-    float o[3];
-    from_point(o, a, s);
     int n = 0;
     for (int i = 0; i < a->n_padded; i += LANES) {
-        struct incoming in = light_at(a, i, s, o);
+        struct incoming in = light_at_exact(a, i, s);
         if (soft)
             in.weight = in.weight * v_bytes(soft + i, a->n - i) * v_set1(1 / 255.f);
         // weight > 0 holds for lights above the horizon that face the point, and for no padding.
         const v_mask keep = v_positive(in.weight, visible_bits(visible, i));
         v_compress(out->lx + n, in.lx, keep), v_compress(out->ly + n, in.ly, keep);
+        v_compress(out->lx_rest + n, in.lx_rest, keep), v_compress(out->ly_rest + n, in.ly_rest, keep);
         v_compress(out->nl + n, in.nl, keep);
         v_compress(out->wr + n, in.weight * v_load(a->cr + i), keep);
         v_compress(out->wg + n, in.weight * v_load(a->cg + i), keep);
@@ -386,13 +461,35 @@ static void gather(struct lit *out, const struct light_arrays *a, const struct s
     }
     out->n = n;
     for (int i = n; i % KERNEL_WIDTH; i++) {
-        out->lx[i] = out->ly[i] = out->wr[i] = out->wg[i] = out->wb[i] = 0;
+        out->lx[i] = out->ly[i] = out->lx_rest[i] = out->ly_rest[i] = 0;
+        out->wr[i] = out->wg[i] = out->wb[i] = 0;
         out->nl[i] = 1;
     }
     for (int i = 0; i < n; i += LANES) {
         const vf nl = v_load(out->nl + i);
         v_store(out->sl + i, v_schlick(nl));
         v_store(out->gc + i, v_coat_g(nl));
+    }
+}
+
+INLINE void brute_all(double sums[N_SUMS][3], const struct light_arrays *a, const struct surface_point *s,
+                      const struct constants *k, bool sharp)
+{
+    for (int begin = 0; begin < a->n_padded; begin += BLOCK) {
+        const int end = a->n_padded - begin < BLOCK ? a->n_padded : begin + BLOCK;
+        vf sum[N_SUMS][3];
+        clear_sums(sum);
+        for (int i = begin; i < end; i += LANES) {
+            const struct incoming in = sharp ? light_at_exact(a, i, s) : light_at(a, i, s);
+            struct light_vector l = { .lx = in.lx, .ly = in.ly, .nl = in.nl };
+            if (sharp)
+                l.lx_rest = in.lx_rest, l.ly_rest = in.ly_rest;
+            l.sl = v_schlick(l.nl), l.gc = v_coat_g(l.nl);
+            l.w[0] = in.weight * v_load(a->cr + i), l.w[1] = in.weight * v_load(a->cg + i);
+            l.w[2] = in.weight * v_load(a->cb + i);
+            jacobian_light(sum, k, &l, sharp);
+        }
+        add_up(&sum[0][0], N_SUMS * 3, &sums[0][0]);
     }
 }
 
@@ -404,37 +501,23 @@ static void brute_jacobian(struct shade_jacobian *out, const struct light_arrays
     *out = (struct shade_jacobian){ 0 };
     if (!find_constants(&k, &t, s, v, m))
         return;
-    float o[3];
-    from_point(o, a, s);
     double sums[N_SUMS][3] = { 0 };
-    for (int begin = 0; begin < a->n_padded; begin += BLOCK) {
-        const int end = a->n_padded - begin < BLOCK ? a->n_padded : begin + BLOCK;
-        vf sum[N_SUMS][3];
-        clear_sums(sum);
-        for (int i = begin; i < end; i += LANES) {
-            const struct incoming in = light_at(a, i, s, o);
-            struct light_vector l = { .lx = in.lx, .ly = in.ly, .nl = in.nl };
-            l.sl = v_schlick(l.nl), l.gc = v_coat_g(l.nl);
-            l.w[0] = in.weight * v_load(a->cr + i), l.w[1] = in.weight * v_load(a->cg + i);
-            l.w[2] = in.weight * v_load(a->cb + i);
-            jacobian_light(sum, &k, &l);
-        }
-        add_up(&sum[0][0], N_SUMS * 3, &sums[0][0]);
-    }
+    if (k.sharp)
+        brute_all(sums, a, s, &k, true);
+    else
+        brute_all(sums, a, s, &k, false);
     finish(out, sums, &k, &t, m);
 }
 
 static void irradiance(float E[3], const struct light_arrays *a, const struct surface_point *s,
                        const uint16_t *visible)
 {
-    float o[3];
-    from_point(o, a, s);
     double sums[3] = { 0 };
     for (int begin = 0; begin < a->n_padded; begin += BLOCK) {
         const int end = a->n_padded - begin < BLOCK ? a->n_padded : begin + BLOCK;
         vf sum[3] = { v_set1(0), v_set1(0), v_set1(0) };
         for (int i = begin; i < end; i += LANES) {
-            const vf w = v_keep(light_at(a, i, s, o).weight, visible_bits(visible, i));
+            const vf w = v_keep(light_at(a, i, s).weight, visible_bits(visible, i));
             sum[0] = v_fma(w, v_load(a->cr + i), sum[0]);
             sum[1] = v_fma(w, v_load(a->cg + i), sum[1]);
             sum[2] = v_fma(w, v_load(a->cb + i), sum[2]);

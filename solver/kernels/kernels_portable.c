@@ -4,6 +4,8 @@
 #include <math.h>
 
 typedef float vf __attribute__((vector_size(16), may_alias));
+typedef double vd __attribute__((vector_size(16)));
+typedef float vh __attribute__((vector_size(8)));
 typedef int32_t vi __attribute__((vector_size(16)));
 typedef unsigned v_mask; // one bit per lane
 enum { LANES = 4 };
@@ -37,6 +39,28 @@ V vf v_max(vf a, vf b)
 V vf v_rcp(vf x)
 {
     return 1 / x;
+}
+V vd d_set1(double x)
+{
+    return (vd){ x, x };
+}
+V vd d_fma(vd a, vd b, vd c)
+{
+    return a * b + c;
+}
+V vd d_fnma(vd a, vd b, vd c)
+{
+    return c - a * b;
+}
+// Written lane by lane, gcc 12 takes (double)(float)x for x and what float left over is lost.
+V vd d_wide(vf x, int half)
+{
+    return __builtin_convertvector((half ? (vh){ x[2], x[3] } : (vh){ x[0], x[1] }), vd);
+}
+V vf d_narrow(vd low, vd high)
+{
+    const vh a = __builtin_convertvector(low, vh), b = __builtin_convertvector(high, vh);
+    return (vf){ a[0], a[1], b[0], b[1] };
 }
 V vf v_rsqrt_sqrt(vf x, vf *root)
 {

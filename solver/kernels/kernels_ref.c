@@ -57,8 +57,9 @@ static void gather(struct lit *out, const struct light_arrays *a, const struct s
         w *= nl * visibility(visible, soft, i);
         if (!(w > 0))
             continue;
-        out->lx[n] = (float)vec3_dot(frame.x, l);
-        out->ly[n] = (float)vec3_dot(frame.y, l);
+        const double lx = vec3_dot(frame.x, l), ly = vec3_dot(frame.y, l);
+        out->lx[n] = (float)lx, out->lx_rest[n] = (float)(lx - (double)out->lx[n]);
+        out->ly[n] = (float)ly, out->ly_rest[n] = (float)(ly - (double)out->ly[n]);
         out->nl[n] = (float)nl;
         out->sl[n] = (float)pow(nl < 1 ? 1 - nl : 0, 5);
         out->gc[n] = (float)(1 / (nl + sqrt(.0625 + .9375 * nl * nl)));
@@ -69,7 +70,7 @@ static void gather(struct lit *out, const struct light_arrays *a, const struct s
     }
     out->n = n;
     for (; n % KERNEL_WIDTH; n++) {
-        out->lx[n] = out->ly[n] = out->sl[n] = out->wr[n] = out->wg[n] = out->wb[n] = 0;
+        out->lx[n] = out->ly[n] = out->lx_rest[n] = out->ly_rest[n] = out->sl[n] = out->wr[n] = out->wg[n] = out->wb[n] = 0;
         out->nl[n] = out->gc[n] = 1;
     }
 }
@@ -84,6 +85,13 @@ static void to_own_frame(double out[3], const struct surface_point *s, const flo
     out[0] = vec3_dot(frame.x, d), out[1] = vec3_dot(frame.y, d), out[2] = vec3_dot(frame.n, d);
 }
 
+static void lit_direction(double l[3], const struct lit *lit, int i)
+{
+    l[0] = (double)lit->lx[i] + (double)lit->lx_rest[i];
+    l[1] = (double)lit->ly[i] + (double)lit->ly_rest[i];
+    l[2] = (double)lit->nl[i];
+}
+
 static void shade(float L[3], const struct lit *lit, const struct surface_point *s, const float v[3],
                   const struct shade_material *m)
 {
@@ -91,7 +99,8 @@ static void shade(float L[3], const struct lit *lit, const struct surface_point 
     double view[3], sum[3] = { 0 };
     to_own_frame(view, s, v);
     for (int i = 0; i < lit->n; i++) {
-        const double l[3] = { (double)lit->lx[i], (double)lit->ly[i], (double)lit->nl[i] };
+        double l[3];
+        lit_direction(l, lit, i);
         double f[3];
         disney_eval(&material, &own_frame, l, view, f);
         sum[0] += f[0] * (double)lit->wr[i], sum[1] += f[1] * (double)lit->wg[i], sum[2] += f[2] * (double)lit->wb[i];
@@ -137,7 +146,8 @@ static void shade_jacobian(struct shade_jacobian *out, const struct lit *lit, co
     struct sums sum = { 0 };
     to_own_frame(view, s, v);
     for (int i = 0; i < lit->n; i++) {
-        const double l[3] = { (double)lit->lx[i], (double)lit->ly[i], (double)lit->nl[i] };
+        double l[3];
+        lit_direction(l, lit, i);
         const double w[3] = { (double)lit->wr[i], (double)lit->wg[i], (double)lit->wb[i] };
         add_light(&sum, &material, &own_frame, l, view, w);
     }
