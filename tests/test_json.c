@@ -1,4 +1,5 @@
-// tests/test_json.c - JSON in and out: values come back, wrong ones are named, broken text is refused by line.
+// tests/test_json.c - JSON in and out: values come back, wrong ones are named, broken text is
+// refused by line.
 #include "solver/take/json.h"
 #include "solver/take/log.h"
 
@@ -35,7 +36,8 @@ static void assert_logged(const char *words)
     const int n_errors = logged.n_errors;
     logged.n_errors = 0;
     if (n_errors != 1 || !strstr(logged.last, words))
-        fail_msg("%d error lines, expected one with \"%s\"; the last: %s", n_errors, words, logged.last);
+        fail_msg("%d error lines, expected one with \"%s\"; the last: %s", n_errors, words,
+                 logged.last);
 }
 
 static struct json *parse(const char *text)
@@ -48,7 +50,8 @@ static struct json *parse(const char *text)
 static const char document[] =
     "{\"stage\": {\"joint\": {\"wall_s\": 2.5, \"rounds\": 12, \"ok\": true}},\n"
     " \"lights\": [{\"dir\": [1, 0.5, -2e3]}, {\"dir\": [0,0,1], \"name\": \"l\\u00e4mp\"}],\n"
-    " \"matrix\": [[1,2,3],[4,5,6],[7,8,9]], \"whole\": 3.0, \"fraction\": 3.5, \"huge\": 1e300, \"null\": null,\n"
+    " \"matrix\": [[1,2,3],[4,5,6],[7,8,9]], \"whole\": 3.0, \"fraction\": 3.5, \"huge\": 1e300, "
+    "\"null\": null,\n"
     " \"long\": 9007199254740993, \"off\": false}";
 
 static void paths_reach_nested_values_and_array_elements(void **state)
@@ -95,8 +98,16 @@ static void missing_is_enoent_and_mistyped_is_einval_and_out_is_kept(void **stat
 {
     (void)state;
     struct json *doc = parse(document);
-    static const char *const missing[] = { "none",     "stage.none",  "lights.2",  "lights.-1", "lights.x", "lights.0x0",
-                                           "stage.joint.wall_s.more", "lights..0", ".",         "lights.4294967296",
+    static const char *const missing[] = { "none",
+                                           "stage.none",
+                                           "lights.2",
+                                           "lights.-1",
+                                           "lights.x",
+                                           "lights.0x0",
+                                           "stage.joint.wall_s.more",
+                                           "lights..0",
+                                           ".",
+                                           "lights.4294967296",
                                            "lights.18446744073709551616" };
     static const char *const not_numbers[] = { "stage", "lights", "null", "lights.1.name", "off" };
     double x = 42, three[3] = { 1, 2, 3 };
@@ -210,7 +221,9 @@ static void every_truncation_is_refused(void **state)
 static void a_written_document_reads_back_the_same(void **state)
 {
     (void)state;
-    static const double hard[] = { .1, 1 / 3., 1e-300, 1.7976931348623157e308, -0., 123456789.123456789, 5e-324 };
+    static const double hard[] = {
+        .1, 1 / 3., 1e-300, 1.7976931348623157e308, -0., 123456789.123456789, 5e-324
+    };
     static const double rows[9] = { 1, 2, 3, 4, 5, 6, 7, 8, 9.5 };
     struct json *doc = json_object(), *list = json_array(), *back;
     double x, nine[9];
@@ -281,7 +294,8 @@ static void the_text_keeps_the_order_of_insertion(void **state)
 static void numbers_have_a_point_in_any_language(void **state)
 {
     (void)state;
-    static const char *const comma_locales[] = { "de_DE.UTF-8", "de_DE.utf8", "fr_FR.UTF-8", "de_DE", NULL };
+    static const char *const comma_locales[] = { "de_DE.UTF-8", "de_DE.utf8", "fr_FR.UTF-8",
+                                                 "de_DE", NULL };
     const char *const *name = comma_locales;
     while (*name && !setlocale(LC_ALL, *name))
         name++;

@@ -1,4 +1,5 @@
-// tests/test_take.c - a take's folder, and what it stands on: files that are whole or not there, the log, progress.
+// tests/test_take.c - a take's folder, and what it stands on: files that are whole or not there,
+// the log, progress.
 #include "solver/take/take.h"
 #include "solver/take/atomic_file.h"
 #include "solver/take/log.h"
@@ -54,7 +55,8 @@ static void listen(void)
 static void assert_logged(int n_errors, const char *words)
 {
     if (logged.n[LOG_ERROR] != n_errors || !strstr(logged.text, words))
-        fail_msg("%d errors, expected %d with \"%s\": %s", logged.n[LOG_ERROR], n_errors, words, logged.text);
+        fail_msg("%d errors, expected %d with \"%s\": %s", logged.n[LOG_ERROR], n_errors, words,
+                 logged.text);
 }
 
 static void put(const char *path, const char *text)
@@ -116,7 +118,7 @@ static int remove_folder(void **state)
     return 0;
 }
 
-// ---- atomic files ---------------------------------------------------------------------------------------------------------
+// ---- atomic files ---------------------------------------------------------------------------
 
 static void the_name_holds_the_old_file_until_commit_and_the_new_one_after(void **state)
 {
@@ -139,7 +141,8 @@ static void the_name_holds_the_old_file_until_commit_and_the_new_one_after(void 
     const mode_t mask = umask(0);
     umask(mask);
     assert_int_equal(stat(path, &st), 0);
-    assert_int_equal(st.st_mode & 0777, 0666 & ~mask); // as any file, not as a private temporary one
+    assert_int_equal(st.st_mode & 0777,
+                     0666 & ~mask); // as any file, not as a private temporary one
 }
 
 static void abandon_leaves_no_trace(void **state)
@@ -208,7 +211,8 @@ static void a_full_device_is_an_error_and_keeps_the_old_file(void **state)
     const char *path = in_folder("old");
     put(path, "old");
     assert_int_equal(atomic_file_open(&f, path), 0);
-    // The part's descriptor becomes the device that is always full: flushing fails as on a full disk.
+    // The part's descriptor becomes the device that is always full: flushing fails as on a full
+    // disk.
     const int full = open("/dev/full", O_RDWR);
     assert_true(full >= 0 && dup2(full, fileno(f.stream)) >= 0);
     close(full);
@@ -244,7 +248,10 @@ static void places_that_cannot_be_written_are_named(void **state)
     static const struct {
         const char *name;
         int err;
-    } cases[] = { { "no/such/folder", -ENOENT }, { "file/below", -ENOTDIR }, { "dir", -EISDIR }, { "dir/", -EISDIR } };
+    } cases[] = { { "no/such/folder", -ENOENT },
+                  { "file/below", -ENOTDIR },
+                  { "dir", -EISDIR },
+                  { "dir/", -EISDIR } };
     struct atomic_file f;
     put(in_folder("file"), "");
     assert_int_equal(mkdir(in_folder("dir"), 0777), 0);
@@ -354,7 +361,7 @@ static void whole_files_are_read_up_to_the_limit(void **state)
     }
 }
 
-// ---- the take folder ------------------------------------------------------------------------------------------------------
+// ---- the take folder ------------------------------------------------------------------------
 
 static void a_new_take_has_its_folders_and_manifest_and_nothing_to_solve(void **state)
 {
@@ -380,7 +387,9 @@ static void a_new_take_has_its_folders_and_manifest_and_nothing_to_solve(void **
     assert_int_equal(take->n_views, 0);
 
     listen();
-    assert_int_equal(take_require(take, TAKE_MESH | TAKE_CAMERAS | TAKE_PANORAMA | TAKE_VIEWS | TAKE_START), -ENOENT);
+    assert_int_equal(
+        take_require(take, TAKE_MESH | TAKE_CAMERAS | TAKE_PANORAMA | TAKE_VIEWS | TAKE_START),
+        -ENOENT);
     assert_logged(5, "mesh.obj");
     assert_logged(5, "geometry/cameras");
     assert_logged(5, "rigctl panorama");
@@ -396,7 +405,8 @@ static void a_new_take_has_its_folders_and_manifest_and_nothing_to_solve(void **
     assert_int_equal(take_create(dir, "again", "2026-11-22T03:00:01Z", "open"), -EEXIST);
     assert_logged(1, "takes/one");
     assert_int_equal(mkdir(in_folder("empty"), 0777), 0);
-    assert_int_equal(take_create(in_folder("empty"), "in an empty folder", "2026-11-22T03:00:00Z", "open"), 0);
+    assert_int_equal(
+        take_create(in_folder("empty"), "in an empty folder", "2026-11-22T03:00:00Z", "open"), 0);
     take_close(NULL);
 }
 
@@ -406,8 +416,10 @@ static void equal_takes_have_equal_manifests(void **state)
     char *bytes[2];
     size_t n[2];
     for (int i = 0; i < 2; i++) {
-        assert_int_equal(take_create(in_folder(i ? "b" : "a"), "name", "2026-11-22T03:00:00Z", "open"), 0);
-        assert_int_equal(file_read(&bytes[i], &n[i], in_folder(i ? "b/take.json" : "a/take.json"), 1 << 20), 0);
+        assert_int_equal(
+            take_create(in_folder(i ? "b" : "a"), "name", "2026-11-22T03:00:00Z", "open"), 0);
+        assert_int_equal(
+            file_read(&bytes[i], &n[i], in_folder(i ? "b/take.json" : "a/take.json"), 1 << 20), 0);
     }
     assert_int_equal(n[0], n[1]);
     assert_memory_equal(bytes[0], bytes[1], n[0]);
@@ -418,10 +430,13 @@ static void equal_takes_have_equal_manifests(void **state)
 static void every_piece_is_found_and_views_are_sorted(void **state)
 {
     (void)state;
-    static const char *const files[] = { "linear/cam010.exr", "linear/cam002.TIF", "linear/B.hdr",     "linear/a.tiff",
-                                         "linear/notes.txt",  "linear/.cam003.exr.abcdef.part",         "linear/.hidden.exr",
-                                         "linear/cam.two.exr", "geometry/mesh.glb", "geometry/mesh.bin", "geometry/other.obj",
-                                         "geometry/cameras/cameras.txt", "panorama.exr", "start.json", "README" };
+    static const char *const files[] = {
+        "linear/cam010.exr",  "linear/cam002.TIF",  "linear/B.hdr",
+        "linear/a.tiff",      "linear/notes.txt",   "linear/.cam003.exr.abcdef.part",
+        "linear/.hidden.exr", "linear/cam.two.exr", "geometry/mesh.glb",
+        "geometry/mesh.bin",  "geometry/other.obj", "geometry/cameras/cameras.txt",
+        "panorama.exr",       "start.json",         "README"
+    };
     static const char *const views[] = { "B", "a", "cam.two", "cam002", "cam010" };
     struct take *take;
     assert_int_equal(make_directories(in_folder("linear")), 0);
@@ -440,7 +455,8 @@ static void every_piece_is_found_and_views_are_sorted(void **state)
     assert_string_equal(take->panorama_path, in_folder("panorama.exr"));
     assert_string_equal(take->start_path, in_folder("start.json"));
     assert_string_equal(take->linear_dir, in_folder("linear"));
-    assert_int_equal(take_require(take, TAKE_MESH | TAKE_CAMERAS | TAKE_PANORAMA | TAKE_VIEWS | TAKE_START), 0);
+    assert_int_equal(
+        take_require(take, TAKE_MESH | TAKE_CAMERAS | TAKE_PANORAMA | TAKE_VIEWS | TAKE_START), 0);
     assert_int_equal(logged.n[LOG_ERROR] + logged.n[LOG_WARNING], 0);
     take_close(take);
 }
@@ -500,7 +516,8 @@ static void a_broken_manifest_and_a_missing_folder_are_named(void **state)
 static void real_studios_open_as_takes(void **state)
 {
     (void)state;
-    static const char *const dirs[] = { "../shared/data/studio-pebble", "../shared/data/studio-vase" };
+    static const char *const dirs[] = { "../shared/data/studio-pebble",
+                                        "../shared/data/studio-vase" };
     if (access("../shared/data", F_OK)) {
         fprintf(stderr, "test_take: no ../shared/data here: real studios not tried\n");
         return;
@@ -510,12 +527,14 @@ static void real_studios_open_as_takes(void **state)
         assert_int_equal(take_open(&take, dirs[i]), 0);
         assert_int_equal(take->n_views, 85);
         assert_string_equal(take->view_names[84], "cam084");
-        assert_int_equal(take_require(take, TAKE_MESH | TAKE_CAMERAS | TAKE_PANORAMA | TAKE_VIEWS | TAKE_START), 0);
+        assert_int_equal(
+            take_require(take, TAKE_MESH | TAKE_CAMERAS | TAKE_PANORAMA | TAKE_VIEWS | TAKE_START),
+            0);
         take_close(take);
     }
 }
 
-// ---- log and progress -----------------------------------------------------------------------------------------------------
+// ---- log and progress -----------------------------------------------------------------------
 
 // What a child writes to stderr.
 static void stderr_of(void (*body)(void), char *out, size_t size)
@@ -559,11 +578,15 @@ static void a_line_of_the_log_stays_one_line(void **state)
     (void)state;
     char text[2048];
     stderr_of(log_as_text, text, sizeof(text));
-    assert_string_equal(text, "test: error: mesh: evil?name?[2J.obj:12: no triangles\ntest: warning: no module here\n");
+    assert_string_equal(
+        text,
+        "test: error: mesh: evil?name?[2J.obj:12: no triangles\ntest: warning: no module here\n");
     stderr_of(log_as_json, text, sizeof(text));
-    assert_string_equal(text, "{\"level\":\"error\",\"module\":\"mesh\",\"message\":\"\\\"a\\\\b\\\"\\u000a\\ufffd\xc3\xa9"
-                              "\\ufffd\\ufffd\\ufffd: tail\"}\n"
-                              "{\"level\":\"info\",\"module\":\"\",\"message\":\"no module here\"}\n");
+    assert_string_equal(text,
+                        "{\"level\":\"error\",\"module\":\"mesh\",\"message\":"
+                        "\"\\\"a\\\\b\\\"\\u000a\\ufffd\xc3\xa9"
+                        "\\ufffd\\ufffd\\ufffd: tail\"}\n"
+                        "{\"level\":\"info\",\"module\":\"\",\"message\":\"no module here\"}\n");
     struct json *doc;
     *strchr(text, '\n') = 0;
     assert_int_equal(json_parse(&doc, text, strlen(text), "log"), 0); // and it is JSON
