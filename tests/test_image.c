@@ -1,4 +1,5 @@
-// tests/test_image.c - pictures come back as they were written, and broken ones are refused by name.
+// tests/test_image.c - pictures come back as they were written, and broken ones are refused by
+// name.
 #include "solver/take/image.h"
 #include "solver/take/image_formats.h"
 #include "solver/take/log.h"
@@ -35,7 +36,7 @@ static const char *in_folder(const char *name)
     return path;
 }
 
-// ---- what was logged ------------------------------------------------------------------------------------------------------
+// ---- what was logged ------------------------------------------------------------------------
 
 static struct {
     int n_errors;
@@ -61,13 +62,14 @@ static void listen(void)
 static void assert_logged_words(const char *const *words, int line)
 {
     if (logged.n_errors != 1)
-        fail_msg("line %d: %d error lines instead of one; the last: %s", line, logged.n_errors, logged.last);
+        fail_msg("line %d: %d error lines instead of one; the last: %s", line, logged.n_errors,
+                 logged.last);
     for (; *words; words++)
         if (!strstr(logged.last, *words))
             fail_msg("line %d: no \"%s\" in: %s", line, *words, logged.last);
 }
 
-// ---- helpers --------------------------------------------------------------------------------------------------------------
+// ---- helpers --------------------------------------------------------------------------------
 
 static uint8_t *read_all(const char *path, size_t *n)
 {
@@ -124,10 +126,34 @@ static void empty_folder(void)
 
 static float wild_value(uint32_t i)
 {
-    static const float hard[] = { 0,        -0.f,     1,          -1,       65504,     -65504,    65519,  65520,
-                                  65536,    1e30f,    -1e30f,     0x1p-14f, 0x1p-24f,  0x1p-25f,  0x1.001p-25f,
-                                  0x3p-25f, 0x5p-26f, 1 + 0x1p-11f, 1 + 0x3p-11f, 0x1.ffep-15f, 0x1.fffp-15f,
-                                  3e-8f,    2047.5f,  2048.5f,    4097,     1e-20f,    -3e-6f,    .1f };
+    static const float hard[] = { 0,
+                                  -0.f,
+                                  1,
+                                  -1,
+                                  65504,
+                                  -65504,
+                                  65519,
+                                  65520,
+                                  65536,
+                                  1e30f,
+                                  -1e30f,
+                                  0x1p-14f,
+                                  0x1p-24f,
+                                  0x1p-25f,
+                                  0x1.001p-25f,
+                                  0x3p-25f,
+                                  0x5p-26f,
+                                  1 + 0x1p-11f,
+                                  1 + 0x3p-11f,
+                                  0x1.ffep-15f,
+                                  0x1.fffp-15f,
+                                  3e-8f,
+                                  2047.5f,
+                                  2048.5f,
+                                  4097,
+                                  1e-20f,
+                                  -3e-6f,
+                                  .1f };
     enum { N_HARD = sizeof(hard) / sizeof(hard[0]) };
     if (i % 3 == 0)
         return hard[i / 3 % N_HARD];
@@ -148,13 +174,23 @@ static double nearest_half(double x)
     return fabs(rounded) > 65504 ? copysign(65504, x) : rounded;
 }
 
-static const char *const eleven_names[] = { "R", "G", "B", "subsurface", "metallic", "specular", "clip",
-                                            "roughness", "view.left.N", "A", "depth of the scene, metres (32 bits)" };
+static const char *const eleven_names[] = { "R",
+                                            "G",
+                                            "B",
+                                            "subsurface",
+                                            "metallic",
+                                            "specular",
+                                            "clip",
+                                            "roughness",
+                                            "view.left.N",
+                                            "A",
+                                            "depth of the scene, metres (32 bits)" };
 
 static struct image make_image(int width, int height, int n_channels)
 {
     struct image image;
-    assert_int_equal(image_new(&image, width, height, n_channels, n_channels == 11 ? eleven_names : NULL), 0);
+    assert_int_equal(
+        image_new(&image, width, height, n_channels, n_channels == 11 ? eleven_names : NULL), 0);
     for (int i = 0; i < width * height * n_channels; i++)
         image.data[i] = wild_value((uint32_t)i);
     return image;
@@ -173,17 +209,19 @@ static void assert_same_image(const struct image *a, const struct image *b)
             const float x = a->data[i * (size_t)a->n_channels + (size_t)c];
             const float y = b->data[i * (size_t)b->n_channels + (size_t)d];
             if (memcmp(&x, &y, sizeof(x)))
-                fail_msg("channel %s, pixel %zu: %.9g is not %.9g", a->names[c], i, (double)x, (double)y);
+                fail_msg("channel %s, pixel %zu: %.9g is not %.9g", a->names[c], i, (double)x,
+                         (double)y);
         }
     }
 }
 
-// ---- EXR ------------------------------------------------------------------------------------------------------------------
+// ---- EXR ------------------------------------------------------------------------------------
 
 static void exr_comes_back_exactly_as_float_and_to_the_nearest_as_half(void **state)
 {
     (void)state;
-    static const int sizes[][2] = { { 1, 1 }, { 7, 5 }, { 33, 31 }, { 131, 67 }, { 1, 40 } }, channels[] = { 1, 3, 4, 11 };
+    static const int sizes[][2] = { { 1, 1 }, { 7, 5 }, { 33, 31 }, { 131, 67 }, { 1, 40 } },
+                     channels[] = { 1, 3, 4, 11 };
     for (int s = 0; s < 5; s++)
         for (int c = 0; c < 4; c++)
             for (int type = IMAGE_HALF; type <= IMAGE_FLOAT; type++)
@@ -191,9 +229,12 @@ static void exr_comes_back_exactly_as_float_and_to_the_nearest_as_half(void **st
                     struct image image = make_image(sizes[s][0], sizes[s][1], channels[c]), back;
                     const char *path = in_folder("round.exr");
                     assert_int_equal(image_write_exr(&image, path, (enum image_type)type,
-                                                     (enum image_compression)compression), 0);
+                                                     (enum image_compression)compression),
+                                     0);
                     assert_int_equal(image_read(&back, path), 0);
-                    for (int i = 0; type == IMAGE_HALF && i < image.width * image.height * image.n_channels; i++)
+                    for (int i = 0;
+                         type == IMAGE_HALF && i < image.width * image.height * image.n_channels;
+                         i++)
                         image.data[i] = (float)nearest_half((double)image.data[i]);
                     assert_same_image(&image, &back);
                     image_free(&image);
@@ -217,8 +258,12 @@ static void half_never_makes_infinities(void **state)
 static void colours_come_first_the_others_in_file_order(void **state)
 {
     (void)state;
-    static const char *const expected[] = { "R", "G", "B", "A", "clip", "depth of the scene, metres (32 bits)", "metallic",
-                                            "roughness", "specular", "subsurface", "view.left.N" };
+    static const char *const expected[] = { "R",          "G",
+                                            "B",          "A",
+                                            "clip",       "depth of the scene, metres (32 bits)",
+                                            "metallic",   "roughness",
+                                            "specular",   "subsurface",
+                                            "view.left.N" };
     struct image image = make_image(3, 2, 11), back;
     assert_int_equal(image_write_exr(&image, in_folder("order.exr"), IMAGE_FLOAT, IMAGE_ZIP), 0);
     assert_int_equal(image_read(&back, in_folder("order.exr")), 0);
@@ -239,7 +284,8 @@ static void equal_pixels_give_equal_bytes(void **state)
         uint8_t *bytes[2];
         for (int i = 0; i < 2; i++) {
             const char *path = in_folder(i ? "second name.exr" : "first.exr");
-            assert_int_equal(image_write_exr(&image, path, IMAGE_HALF, (enum image_compression)compression), 0);
+            assert_int_equal(
+                image_write_exr(&image, path, IMAGE_HALF, (enum image_compression)compression), 0);
             bytes[i] = read_all(path, &n[i]);
         }
         assert_int_equal(n[0], n[1]);
@@ -256,7 +302,8 @@ static void two_channels_of_one_name_are_refused(void **state)
     struct image image = make_image(2, 2, 3);
     strcpy(image.names[2], "R");
     listen();
-    assert_int_equal(image_write_exr(&image, in_folder("twice.exr"), IMAGE_HALF, IMAGE_ZIP), -EINVAL);
+    assert_int_equal(image_write_exr(&image, in_folder("twice.exr"), IMAGE_HALF, IMAGE_ZIP),
+                     -EINVAL);
     assert_logged("twice.exr", "two channels", "R");
     assert_int_not_equal(access(in_folder("twice.exr"), F_OK), 0);
     image_free(&image);
@@ -284,7 +331,7 @@ static void nan_is_named_by_its_pixel(void **state)
     image_free(&image);
 }
 
-// ---- EXR files that we do not write ourselves -----------------------------------------------------------------------------
+// ---- EXR files that we do not write ourselves -----------------------------------------------
 
 struct exr_kind {
     exr_storage_t storage;
@@ -298,10 +345,12 @@ struct exr_kind {
 // What channel c holds at (x, y) of level 0; coarser levels hold -1.
 static double pattern(int c, int x, int y)
 {
-    return c == 2 ? 3000000000.0 + x + 64 * y : (c + 1) * (x + 17 * y) * .25; // exact in half, float and unsigned
+    return c == 2 ? 3000000000.0 + x + 64 * y
+                  : (c + 1) * (x + 17 * y) * .25; // exact in half, float and unsigned
 }
 
-static void write_chunk(exr_context_t context, const exr_chunk_info_t *chunk, int x0, int y0, bool base)
+static void write_chunk(exr_context_t context, const exr_chunk_info_t *chunk, int x0, int y0,
+                        bool base)
 {
     const int width = chunk->width, height = chunk->height;
     exr_encode_pipeline_t encode = EXR_ENCODE_PIPELINE_INITIALIZER;
@@ -342,14 +391,20 @@ static void write_foreign_exr(const char *path, const struct exr_kind *kind)
     int part;
     assert_int_equal(exr_start_write(&context, path, EXR_WRITE_FILE_DIRECTLY, &settings), 0);
     assert_int_equal(exr_add_part(context, NULL, kind->storage, &part), 0);
-    assert_int_equal(exr_initialize_required_attr(context, part, &kind->display, &kind->data, 1, &centre, 1, kind->order,
-                                                  kind->compression), 0);
+    assert_int_equal(exr_initialize_required_attr(context, part, &kind->display, &kind->data, 1,
+                                                  &centre, 1, kind->order, kind->compression),
+                     0);
     if (kind->storage == EXR_STORAGE_TILED)
-        assert_int_equal(exr_set_tile_descriptor(context, part, (uint32_t)kind->tile_width, (uint32_t)kind->tile_height,
-                                                 kind->levels, EXR_TILE_ROUND_DOWN), 0);
-    assert_int_equal(exr_add_channel(context, part, "a", EXR_PIXEL_HALF, EXR_PERCEPTUALLY_LINEAR, 1, 1), 0);
-    assert_int_equal(exr_add_channel(context, part, "b", EXR_PIXEL_FLOAT, EXR_PERCEPTUALLY_LINEAR, 1, 1), 0);
-    assert_int_equal(exr_add_channel(context, part, "c", EXR_PIXEL_UINT, EXR_PERCEPTUALLY_LINEAR, 1, 1), 0);
+        assert_int_equal(exr_set_tile_descriptor(context, part, (uint32_t)kind->tile_width,
+                                                 (uint32_t)kind->tile_height, kind->levels,
+                                                 EXR_TILE_ROUND_DOWN),
+                         0);
+    assert_int_equal(
+        exr_add_channel(context, part, "a", EXR_PIXEL_HALF, EXR_PERCEPTUALLY_LINEAR, 1, 1), 0);
+    assert_int_equal(
+        exr_add_channel(context, part, "b", EXR_PIXEL_FLOAT, EXR_PERCEPTUALLY_LINEAR, 1, 1), 0);
+    assert_int_equal(
+        exr_add_channel(context, part, "c", EXR_PIXEL_UINT, EXR_PERCEPTUALLY_LINEAR, 1, 1), 0);
     assert_int_equal(exr_write_header(context), 0);
     if (kind->storage == EXR_STORAGE_SCANLINE) {
         int32_t step;
@@ -369,7 +424,8 @@ static void write_foreign_exr(const char *path, const struct exr_kind *kind)
                 assert_int_equal(exr_get_level_sizes(context, part, lx, ly, &width, &height), 0);
                 for (int ty = 0; ty * kind->tile_height < height; ty++)
                     for (int tx = 0; tx * kind->tile_width < width; tx++) {
-                        assert_int_equal(exr_write_tile_chunk_info(context, part, tx, ty, lx, ly, &chunk), 0);
+                        assert_int_equal(
+                            exr_write_tile_chunk_info(context, part, tx, ty, lx, ly, &chunk), 0);
                         write_chunk(context, &chunk, kind->data.min.x + tx * kind->tile_width,
                                     kind->data.min.y + ty * kind->tile_height, lx == 0 && ly == 0);
                     }
@@ -386,12 +442,16 @@ static void assert_pattern(const struct image *image, const struct exr_kind *kin
     for (int y = kind->display.min.y; y <= kind->display.max.y; y++)
         for (int x = kind->display.min.x; x <= kind->display.max.x; x++)
             for (int c = 0; c < 3; c++) {
-                const bool inside = x >= kind->data.min.x && x <= kind->data.max.x && y >= kind->data.min.y &&
-                                    y <= kind->data.max.y;
+                const bool inside = x >= kind->data.min.x && x <= kind->data.max.x &&
+                                    y >= kind->data.min.y && y <= kind->data.max.y;
                 const float expected = inside ? (float)pattern(c, x, y) : 0;
-                const float found = image->data[((y - kind->display.min.y) * image->width + x - kind->display.min.x) * 3 + c];
+                const float found = image->data[((y - kind->display.min.y) * image->width + x -
+                                                 kind->display.min.x) *
+                                                    3 +
+                                                c];
                 if (found != expected)
-                    fail_msg("channel %d at (%d, %d): %g is not %g", c, x, y, (double)found, (double)expected);
+                    fail_msg("channel %d at (%d, %d): %g is not %g", c, x, y, (double)found,
+                             (double)expected);
             }
 }
 
@@ -403,12 +463,15 @@ static exr_attr_box2i_t box(int x0, int y0, int x1, int y1)
 static void scanlines_tiles_and_mip_maps_of_half_float_and_unsigned_are_read(void **state)
 {
     (void)state;
-    static const exr_compression_t compressions[] = { EXR_COMPRESSION_NONE, EXR_COMPRESSION_RLE, EXR_COMPRESSION_ZIPS,
-                                                      EXR_COMPRESSION_ZIP, EXR_COMPRESSION_PIZ };
+    static const exr_compression_t compressions[] = { EXR_COMPRESSION_NONE, EXR_COMPRESSION_RLE,
+                                                      EXR_COMPRESSION_ZIPS, EXR_COMPRESSION_ZIP,
+                                                      EXR_COMPRESSION_PIZ };
     struct image image;
     for (size_t i = 0; i < sizeof(compressions) / sizeof(compressions[0]); i++) {
-        struct exr_kind kind = { .storage = EXR_STORAGE_SCANLINE, .compression = compressions[i],
-                                 .data = box(0, 0, 36, 40), .display = box(0, 0, 36, 40) };
+        struct exr_kind kind = { .storage = EXR_STORAGE_SCANLINE,
+                                 .compression = compressions[i],
+                                 .data = box(0, 0, 36, 40),
+                                 .display = box(0, 0, 36, 40) };
         write_foreign_exr(in_folder("lines.exr"), &kind);
         assert_int_equal(image_read(&image, in_folder("lines.exr")), 0);
         assert_pattern(&image, &kind);
@@ -427,13 +490,17 @@ static void scanlines_tiles_and_mip_maps_of_half_float_and_unsigned_are_read(voi
 static void the_data_window_is_placed_in_the_display_window(void **state)
 {
     (void)state;
-    const exr_attr_box2i_t displays[] = { box(0, 0, 39, 39), box(5, 5, 9, 7), box(-10, -20, 12, 12), box(30, 30, 60, 70),
+    const exr_attr_box2i_t displays[] = { box(0, 0, 39, 39),       box(5, 5, 9, 7),
+                                          box(-10, -20, 12, 12),   box(30, 30, 60, 70),
                                           box(100, 100, 103, 102), box(-5, 0, -1, 30) };
     struct image image;
     for (int storage = EXR_STORAGE_SCANLINE; storage <= EXR_STORAGE_TILED; storage++)
         for (size_t i = 0; i < sizeof(displays) / sizeof(displays[0]); i++) {
-            const struct exr_kind kind = { .storage = (exr_storage_t)storage, .compression = EXR_COMPRESSION_ZIP,
-                                           .tile_width = 8, .tile_height = 16, .data = box(3, 2, 37, 38),
+            const struct exr_kind kind = { .storage = (exr_storage_t)storage,
+                                           .compression = EXR_COMPRESSION_ZIP,
+                                           .tile_width = 8,
+                                           .tile_height = 16,
+                                           .data = box(3, 2, 37, 38),
                                            .display = displays[i] };
             write_foreign_exr(in_folder("window.exr"), &kind);
             assert_int_equal(image_read(&image, in_folder("window.exr")), 0);
@@ -501,9 +568,12 @@ static void deep_multi_part_and_subsampled_are_refused_by_name(void **state)
     int part;
     start_odd_exr(&context, in_folder("tmp.exr"));
     for (int i = 0; i < 2; i++) {
-        assert_int_equal(exr_add_part(context, i ? "left" : "right", EXR_STORAGE_SCANLINE, &part), 0);
-        assert_int_equal(exr_initialize_required_attr_simple(context, part, 4, 4, EXR_COMPRESSION_ZIP), 0);
-        assert_int_equal(exr_add_channel(context, part, "Y", EXR_PIXEL_HALF, EXR_PERCEPTUALLY_LINEAR, 1, 1), 0);
+        assert_int_equal(exr_add_part(context, i ? "left" : "right", EXR_STORAGE_SCANLINE, &part),
+                         0);
+        assert_int_equal(
+            exr_initialize_required_attr_simple(context, part, 4, 4, EXR_COMPRESSION_ZIP), 0);
+        assert_int_equal(
+            exr_add_channel(context, part, "Y", EXR_PIXEL_HALF, EXR_PERCEPTUALLY_LINEAR, 1, 1), 0);
     }
     finish_odd_exr(&context, in_folder("tmp.exr"), in_folder("parts.exr"));
     listen();
@@ -512,9 +582,11 @@ static void deep_multi_part_and_subsampled_are_refused_by_name(void **state)
 
     start_odd_exr(&context, in_folder("tmp.exr"));
     assert_int_equal(exr_add_part(context, "deep", EXR_STORAGE_DEEP_SCANLINE, &part), 0);
-    assert_int_equal(exr_initialize_required_attr_simple(context, part, 4, 4, EXR_COMPRESSION_ZIPS), 0);
+    assert_int_equal(exr_initialize_required_attr_simple(context, part, 4, 4, EXR_COMPRESSION_ZIPS),
+                     0);
     assert_int_equal(exr_set_version(context, part, 1), 0);
-    assert_int_equal(exr_add_channel(context, part, "Z", EXR_PIXEL_HALF, EXR_PERCEPTUALLY_LINEAR, 1, 1), 0);
+    assert_int_equal(
+        exr_add_channel(context, part, "Z", EXR_PIXEL_HALF, EXR_PERCEPTUALLY_LINEAR, 1, 1), 0);
     finish_odd_exr(&context, in_folder("tmp.exr"), in_folder("deep.exr"));
     listen();
     assert_int_equal(image_read(&back, in_folder("deep.exr")), -ENOTSUP);
@@ -522,8 +594,10 @@ static void deep_multi_part_and_subsampled_are_refused_by_name(void **state)
 
     start_odd_exr(&context, in_folder("tmp.exr"));
     assert_int_equal(exr_add_part(context, NULL, EXR_STORAGE_SCANLINE, &part), 0);
-    assert_int_equal(exr_initialize_required_attr_simple(context, part, 4, 4, EXR_COMPRESSION_ZIP), 0);
-    assert_int_equal(exr_add_channel(context, part, "BY", EXR_PIXEL_HALF, EXR_PERCEPTUALLY_LINEAR, 2, 2), 0);
+    assert_int_equal(exr_initialize_required_attr_simple(context, part, 4, 4, EXR_COMPRESSION_ZIP),
+                     0);
+    assert_int_equal(
+        exr_add_channel(context, part, "BY", EXR_PIXEL_HALF, EXR_PERCEPTUALLY_LINEAR, 2, 2), 0);
     finish_odd_exr(&context, in_folder("tmp.exr"), in_folder("yc.exr"));
     listen();
     assert_int_equal(image_read(&back, in_folder("yc.exr")), -ENOTSUP);
@@ -533,9 +607,9 @@ static void deep_multi_part_and_subsampled_are_refused_by_name(void **state)
 static void a_header_that_asks_for_more_than_the_file_can_hold_is_refused(void **state)
 {
     (void)state;
-    static const int32_t windows[][4] = { { 0, 0, 65535, 4095 },      // 1.6 GB of pixels
-                                          { 0, 0, 65536, 3 },         // one side too long
-                                          { 0, 0, 2147483646, 0 },    // far too long
+    static const int32_t windows[][4] = { { 0, 0, 65535, 4095 },   // 1.6 GB of pixels
+                                          { 0, 0, 65536, 3 },      // one side too long
+                                          { 0, 0, 2147483646, 0 }, // far too long
                                           { -2147483647, 0, 2147483647, 5 } };
     static const char *const names[] = { "dataWindow", "displayWindow" };
     struct image image = make_image(9, 9, 3), back;
@@ -583,27 +657,31 @@ static void a_large_black_picture_is_not_taken_for_an_attack(void **state)
 {
     (void)state;
     struct image image, back;
-    assert_int_equal(image_new(&image, 6000, 4000, 1, NULL), 0);
+    assert_int_equal(image_new(&image, 7000, 6400, 1, NULL), 0); // 85 MiB of halves in 100 kB
     assert_int_equal(image_write_exr(&image, in_folder("black.exr"), IMAGE_HALF, IMAGE_ZIP), 0);
     assert_int_equal(image_read(&back, in_folder("black.exr")), 0);
-    assert_int_equal(back.width, 6000);
+    assert_int_equal(back.width, 7000);
     image_free(&back);
+    image_free(&image);
+    assert_int_equal(image_new(&image, 6000, 4000, 1, NULL), 0);
     assert_int_equal(image_write_png_srgb(&image, in_folder("black.png"), 0), 0);
     assert_int_equal(image_read(&back, in_folder("black.png")), 0);
     image_free(&back);
     image_free(&image);
 }
 
-// ---- Radiance -------------------------------------------------------------------------------------------------------------
+// ---- Radiance -------------------------------------------------------------------------------
 
 // Mantissas and exponent as in the Radiance sources: (m + .5) 2^(e - 136).
-static void assert_hdr_pixels(const struct image *image, const uint8_t (*rgbe)[4], int n, double scale)
+static void assert_hdr_pixels(const struct image *image, const uint8_t (*rgbe)[4], int n,
+                              double scale)
 {
     assert_int_equal(image->n_channels, 3);
     assert_int_equal(image->width * image->height, n);
     for (int i = 0; i < n; i++)
         for (int c = 0; c < 3; c++) {
-            const double expected = rgbe[i][3] ? (rgbe[i][c] + .5) * pow(2, rgbe[i][3] - 136.) * scale : 0;
+            const double expected =
+                rgbe[i][3] ? (rgbe[i][c] + .5) * pow(2, rgbe[i][3] - 136.) * scale : 0;
             assert_true(image->data[3 * i + c] == (float)expected);
         }
 }
@@ -619,16 +697,20 @@ static size_t hdr_text(char *out, const char *header, const uint8_t *pixels, siz
 static void radiance_flat_old_and_new_runs_decode_alike(void **state)
 {
     (void)state;
-    static const uint8_t expected[10][4] = { { 255, 128, 1, 129 }, { 9, 9, 9, 100 }, { 9, 9, 9, 100 }, { 9, 9, 9, 100 },
-                                             { 9, 9, 9, 100 }, { 0, 0, 0, 0 }, { 7, 8, 9, 255 }, { 3, 4, 5, 1 },
-                                             { 3, 4, 5, 1 }, { 200, 0, 255, 0 } };
-    static const uint8_t old_runs[] = { 255, 128, 1, 129, 9, 9, 9, 100, 1, 1, 1, 3, 0, 0, 0, 0, 7, 8, 9, 255, 3, 4, 5, 1,
-                                        1, 1, 1, 1, 200, 0, 255, 0 };
-    static const uint8_t new_runs[] = { 2, 2, 0, 10,
-                                        1, 255, 128 + 4, 9, 5, 0, 7, 3, 3, 200,
-                                        1, 128, 128 + 4, 9, 5, 0, 8, 4, 4, 0,
-                                        1, 1, 128 + 4, 9, 2, 0, 9, 128 + 2, 5, 1, 255,
-                                        1, 129, 128 + 4, 100, 2, 0, 255, 128 + 2, 1, 1, 0 };
+    static const uint8_t expected[10][4] = { { 255, 128, 1, 129 }, { 9, 9, 9, 100 },
+                                             { 9, 9, 9, 100 },     { 9, 9, 9, 100 },
+                                             { 9, 9, 9, 100 },     { 0, 0, 0, 0 },
+                                             { 7, 8, 9, 255 },     { 3, 4, 5, 1 },
+                                             { 3, 4, 5, 1 },       { 200, 0, 255, 0 } };
+    static const uint8_t old_runs[] = {
+        255, 128, 1, 129, 9, 9, 9, 100, 1, 1, 1, 3, 0,   0, 0,   0,
+        7,   8,   9, 255, 3, 4, 5, 1,   1, 1, 1, 1, 200, 0, 255, 0
+    };
+    static const uint8_t new_runs[] = {
+        2,       2, 0,   10, 1,   255,     128 + 4, 9, 5, 0,   7,       3, 3, 200, 1, 128,
+        128 + 4, 9, 5,   0,  8,   4,       4,       0, 1, 1,   128 + 4, 9, 2, 0,   9, 128 + 2,
+        5,       1, 255, 1,  129, 128 + 4, 100,     2, 0, 255, 128 + 2, 1, 1, 0
+    };
     static const char header[] = "#?RADIANCE\n# a comment\nFORMAT=32-bit_rle_rgbe\n\n-Y 1 +X 10\n";
     char text[512];
     struct image image;
@@ -664,10 +746,11 @@ static void radiance_exposure_and_colour_correction_are_divided_out(void **state
     static const uint8_t pixel[1][4] = { { 100, 150, 200, 130 } };
     char text[256];
     struct image image;
-    const size_t n = hdr_text(text,
-                              "#?RADIANCE\nEXPOSURE=0.5\nEXPOSURE= 4.0e0\nCOLORCORR=2 4 8\nCOLORCORR= 0.5 .25 0.125\n\n"
-                              "-Y 1 +X 1\n",
-                              &pixel[0][0], 4);
+    const size_t n = hdr_text(
+        text,
+        "#?RADIANCE\nEXPOSURE=0.5\nEXPOSURE= 4.0e0\nCOLORCORR=2 4 8\nCOLORCORR= 0.5 .25 0.125\n\n"
+        "-Y 1 +X 1\n",
+        &pixel[0][0], 4);
     assert_int_equal(read_text(&image, text, n), 0);
     assert_hdr_pixels(&image, pixel, 1, .5);
     image_free(&image);
@@ -681,7 +764,8 @@ static void radiance_files_of_another_kind_are_refused_by_name(void **state)
         int err;
         const char *word;
     } cases[] = {
-        { "#?RADIANCE\nFORMAT=32-bit_rle_xyze\n\n-Y 1 +X 1\n1234", -ENOTSUP, "memory:2: found FORMAT=32-bit_rle_xyze" },
+        { "#?RADIANCE\nFORMAT=32-bit_rle_xyze\n\n-Y 1 +X 1\n1234", -ENOTSUP,
+          "memory:2: found FORMAT=32-bit_rle_xyze" },
         { "#?RADIANCE\n\n+Y 1 +X 1\n1234", -ENOTSUP, "+Y +X" },
         { "#?RADIANCE\n\n-Y 1 -X 1\n1234", -ENOTSUP, "-Y -X" },
         { "#?RADIANCE\n\n+X 1 -Y 1\n1234", -ENOTSUP, "+X -Y" },
@@ -704,7 +788,7 @@ static void radiance_files_of_another_kind_are_refused_by_name(void **state)
     }
 }
 
-// ---- TIFF -----------------------------------------------------------------------------------------------------------------
+// ---- TIFF -----------------------------------------------------------------------------------
 
 struct tiff_kind {
     int bits, n_samples, tile, planes, compression;
@@ -735,8 +819,10 @@ static void write_tiff(const char *path, const struct tiff_kind *kind, int width
     TIFFSetField(tiff, TIFFTAG_IMAGELENGTH, height);
     TIFFSetField(tiff, TIFFTAG_BITSPERSAMPLE, kind->bits);
     TIFFSetField(tiff, TIFFTAG_SAMPLESPERPIXEL, kind->n_samples);
-    TIFFSetField(tiff, TIFFTAG_SAMPLEFORMAT, kind->bits == 32 ? SAMPLEFORMAT_IEEEFP : SAMPLEFORMAT_UINT);
-    TIFFSetField(tiff, TIFFTAG_PHOTOMETRIC, kind->n_samples == 1 ? PHOTOMETRIC_MINISBLACK : PHOTOMETRIC_RGB);
+    TIFFSetField(tiff, TIFFTAG_SAMPLEFORMAT,
+                 kind->bits == 32 ? SAMPLEFORMAT_IEEEFP : SAMPLEFORMAT_UINT);
+    TIFFSetField(tiff, TIFFTAG_PHOTOMETRIC,
+                 kind->n_samples == 1 ? PHOTOMETRIC_MINISBLACK : PHOTOMETRIC_RGB);
     TIFFSetField(tiff, TIFFTAG_PLANARCONFIG, kind->planes);
     TIFFSetField(tiff, TIFFTAG_COMPRESSION, kind->compression);
     if (kind->n_samples == 4)
@@ -760,12 +846,14 @@ static void write_tiff(const char *path, const struct tiff_kind *kind, int width
                             put_sample(kind, buffer + ((y * step_x + x) * n_inside + c) * size,
                                        tiff_value(kind, x0 + x, y0 + y, plane + c));
                 if (kind->tile) {
-                    assert_true(TIFFWriteTile(tiff, buffer, (uint32_t)x0, (uint32_t)y0, 0, (uint16_t)plane) > 0);
+                    assert_true(TIFFWriteTile(tiff, buffer, (uint32_t)x0, (uint32_t)y0, 0,
+                                              (uint16_t)plane) > 0);
                     continue;
                 }
                 const int n_rows = height - y0 < step_y ? height - y0 : step_y;
-                assert_true(TIFFWriteEncodedStrip(tiff, TIFFComputeStrip(tiff, (uint32_t)y0, (uint16_t)plane), buffer,
-                                                  n_rows * width * n_inside * size) > 0);
+                assert_true(TIFFWriteEncodedStrip(
+                                tiff, TIFFComputeStrip(tiff, (uint32_t)y0, (uint16_t)plane), buffer,
+                                n_rows * width * n_inside * size) > 0);
             }
     free(buffer);
     TIFFClose(tiff);
@@ -775,12 +863,16 @@ static void tiff_of_every_layout_is_read(void **state)
 {
     (void)state;
     static const int bits[] = { 8, 16, 32 }, samples[] = { 1, 3, 4 };
-    static const int compressions[] = { COMPRESSION_NONE, COMPRESSION_LZW, COMPRESSION_ADOBE_DEFLATE, COMPRESSION_PACKBITS };
+    static const int compressions[] = { COMPRESSION_NONE, COMPRESSION_LZW,
+                                        COMPRESSION_ADOBE_DEFLATE, COMPRESSION_PACKBITS };
     static const char *const modes[] = { "wl", "wb", "w8" };
     for (int i = 0; i < 3 * 3 * 2 * 2 * 4 * 3; i++) {
         struct image image;
-        const struct tiff_kind kind = { bits[i % 3], samples[i / 3 % 3], i / 9 % 2,
-                                        i / 18 % 2 ? PLANARCONFIG_SEPARATE : PLANARCONFIG_CONTIG, compressions[i / 36 % 4],
+        const struct tiff_kind kind = { bits[i % 3],
+                                        samples[i / 3 % 3],
+                                        i / 9 % 2,
+                                        i / 18 % 2 ? PLANARCONFIG_SEPARATE : PLANARCONFIG_CONTIG,
+                                        compressions[i / 36 % 4],
                                         modes[i / 144] };
         write_tiff(in_folder("t.tif"), &kind, 37, 41);
         assert_int_equal(image_read(&image, in_folder("t.tif")), 0);
@@ -830,14 +922,15 @@ static void tiff_of_another_kind_is_refused_by_name(void **state)
     };
     struct image image;
     for (size_t i = 0; i < sizeof(cases) / sizeof(cases[0]); i++) {
-        set_tags(in_folder("odd.tif"), cases[i].photometric, cases[i].n_samples, cases[i].bits, cases[i].format);
+        set_tags(in_folder("odd.tif"), cases[i].photometric, cases[i].n_samples, cases[i].bits,
+                 cases[i].format);
         listen();
         assert_int_equal(image_read(&image, in_folder("odd.tif")), -ENOTSUP);
         assert_logged("odd.tif", cases[i].word);
     }
 }
 
-// ---- PNG ------------------------------------------------------------------------------------------------------------------
+// ---- PNG ------------------------------------------------------------------------------------
 
 static void png_comes_back_as_value_over_max(void **state)
 {
@@ -864,15 +957,15 @@ static void png_comes_back_as_value_over_max(void **state)
 }
 
 // By libpng itself: kinds that we read but never write.
-static void write_foreign_png(const char *path, int type, int depth, const uint8_t *rows, size_t row_bytes, int n_rows,
-                              int width)
+static void write_foreign_png(const char *path, int type, int depth, const uint8_t *rows,
+                              size_t row_bytes, int n_rows, int width)
 {
     png_structp png = png_create_write_struct(PNG_LIBPNG_VER_STRING, NULL, NULL, NULL);
     png_infop info = png_create_info_struct(png);
     FILE *f = fopen(path, "wb");
     png_init_io(png, f);
-    png_set_IHDR(png, info, (png_uint_32)width, (png_uint_32)n_rows, depth, type, PNG_INTERLACE_ADAM7,
-                 PNG_COMPRESSION_TYPE_DEFAULT, PNG_FILTER_TYPE_DEFAULT);
+    png_set_IHDR(png, info, (png_uint_32)width, (png_uint_32)n_rows, depth, type,
+                 PNG_INTERLACE_ADAM7, PNG_COMPRESSION_TYPE_DEFAULT, PNG_FILTER_TYPE_DEFAULT);
     const png_color palette[2] = { { 10, 20, 30 }, { 255, 0, 51 } };
     if (type == PNG_COLOR_TYPE_PALETTE)
         png_set_PLTE(png, info, palette, 2);
@@ -889,12 +982,13 @@ static void write_foreign_png(const char *path, int type, int depth, const uint8
 static void png_of_sixteen_bits_one_bit_and_palette_is_read(void **state)
 {
     (void)state;
-    static const uint8_t deep[] = { 0, 1, 255, 255, 18, 52, 128, 0, 0, 0, 1, 0 }, bits[] = { 0xa0, 0x40 };
+    static const uint8_t deep[] = { 0, 1, 255, 255, 18, 52, 128, 0, 0, 0, 1, 0 },
+                         bits[] = { 0xa0, 0x40 };
     struct image image;
     write_foreign_png(in_folder("16.png"), PNG_COLOR_TYPE_RGB, 16, deep, 6, 2, 1);
     assert_int_equal(image_read(&image, in_folder("16.png")), 0);
-    assert_true(image.data[0] == 1.f / 65535 && image.data[1] == 1 && image.data[2] == 0x1234 / 65535.f &&
-                image.data[3] == 0x8000 / 65535.f);
+    assert_true(image.data[0] == 1.f / 65535 && image.data[1] == 1 &&
+                image.data[2] == 0x1234 / 65535.f && image.data[3] == 0x8000 / 65535.f);
     image_free(&image);
     write_foreign_png(in_folder("1.png"), PNG_COLOR_TYPE_GRAY, 1, bits, 1, 2, 3);
     assert_int_equal(image_read(&image, in_folder("1.png")), 0);
@@ -904,7 +998,8 @@ static void png_of_sixteen_bits_one_bit_and_palette_is_read(void **state)
     write_foreign_png(in_folder("palette.png"), PNG_COLOR_TYPE_PALETTE, 1, bits, 1, 2, 3);
     assert_int_equal(image_read(&image, in_folder("palette.png")), 0);
     assert_int_equal(image.n_channels, 3);
-    assert_true(image.data[0] == 1 && image.data[1] == 0 && image.data[2] == .2f && image.data[3] == 10.f / 255);
+    assert_true(image.data[0] == 1 && image.data[1] == 0 && image.data[2] == .2f &&
+                image.data[3] == 10.f / 255);
     image_free(&image);
     write_foreign_png(in_folder("ga.png"), PNG_COLOR_TYPE_GRAY_ALPHA, 8, deep, 6, 2, 3);
     assert_int_equal(image_read(&image, in_folder("ga.png")), 0);
@@ -923,7 +1018,8 @@ static void tone_mapped_png_follows_the_srgb_curve(void **state)
     struct image image, back;
     assert_int_equal(image_new(&image, 8, 1, 4, NULL), 0);
     for (int i = 0; i < 8; i++)
-        image.data[4 * i] = linear[i], image.data[4 * i + 1] = linear[i] / 4, image.data[4 * i + 2] = NAN;
+        image.data[4 * i] = linear[i], image.data[4 * i + 1] = linear[i] / 4,
+                       image.data[4 * i + 2] = NAN;
     assert_int_equal(image_write_png_srgb(&image, in_folder("s.png"), 0), 0);
     assert_int_equal(image_read(&back, in_folder("s.png")), 0);
     assert_int_equal(back.n_channels, 3);
@@ -940,7 +1036,7 @@ static void tone_mapped_png_follows_the_srgb_curve(void **state)
     image_free(&image);
 }
 
-// ---- broken files ---------------------------------------------------------------------------------------------------------
+// ---- broken files ---------------------------------------------------------------------------
 
 static int make_sample(const char *kind, uint8_t **bytes, size_t *n)
 {
@@ -957,19 +1053,32 @@ static int make_sample(const char *kind, uint8_t **bytes, size_t *n)
     else if (!strcmp(kind, "png"))
         assert_int_equal(image_write_png_srgb(&image, path, 0), 0);
     else if (!strcmp(kind, "rle") || !strcmp(kind, "tiles") || !strcmp(kind, "none"))
-        write_foreign_exr(path, &(struct exr_kind){
-            .storage = !strcmp(kind, "tiles") ? EXR_STORAGE_TILED : EXR_STORAGE_SCANLINE,
-            .compression = !strcmp(kind, "none") ? EXR_COMPRESSION_NONE : EXR_COMPRESSION_RLE, .tile_width = 8,
-            .tile_height = 8, .levels = EXR_TILE_MIPMAP_LEVELS, .data = box(1, 1, 12, 13), .display = box(0, 0, 14, 13) });
+        write_foreign_exr(
+            path,
+            &(struct exr_kind){
+                .storage = !strcmp(kind, "tiles") ? EXR_STORAGE_TILED : EXR_STORAGE_SCANLINE,
+                .compression = !strcmp(kind, "none") ? EXR_COMPRESSION_NONE : EXR_COMPRESSION_RLE,
+                .tile_width = 8,
+                .tile_height = 8,
+                .levels = EXR_TILE_MIPMAP_LEVELS,
+                .data = box(1, 1, 12, 13),
+                .display = box(0, 0, 14, 13) });
     else if (!strcmp(kind, "hdr")) {
-        static const uint8_t pixels[] = { 2, 2, 0, 10, 138, 9, 138, 8, 138, 7, 138, 130, 2, 2, 0, 10,
-                                          10, 1, 2, 3, 4, 5, 6, 7, 8, 9, 10, 138, 8, 138, 7, 138, 130 };
+        static const uint8_t pixels[] = { 2,   2, 0, 10, 138, 9,   138, 8,   138, 7,   138,
+                                          130, 2, 2, 0,  10,  10,  1,   2,   3,   4,   5,
+                                          6,   7, 8, 9,  10,  138, 8,   138, 7,   138, 130 };
         char text[256];
-        write_all(path, text, hdr_text(text, "#?RADIANCE\nFORMAT=32-bit_rle_rgbe\nEXPOSURE=1\n\n-Y 2 +X 10\n", pixels,
-                                       sizeof(pixels)));
+        write_all(path, text,
+                  hdr_text(text, "#?RADIANCE\nFORMAT=32-bit_rle_rgbe\nEXPOSURE=1\n\n-Y 2 +X 10\n",
+                           pixels, sizeof(pixels)));
     } else {
-        const struct tiff_kind tiff = { 16, 3, !strcmp(kind, "tile.tif"), PLANARCONFIG_CONTIG,
-                                        !strcmp(kind, "lzw.tif") ? COMPRESSION_LZW : COMPRESSION_ADOBE_DEFLATE, "wl" };
+        const struct tiff_kind tiff = { 16,
+                                        3,
+                                        !strcmp(kind, "tile.tif"),
+                                        PLANARCONFIG_CONTIG,
+                                        !strcmp(kind, "lzw.tif") ? COMPRESSION_LZW
+                                                                 : COMPRESSION_ADOBE_DEFLATE,
+                                        "wl" };
         write_tiff(path, &tiff, 13, 11);
     }
     image_free(&image);
@@ -977,7 +1086,8 @@ static int make_sample(const char *kind, uint8_t **bytes, size_t *n)
     return 0;
 }
 
-static const char *const sample_kinds[] = { "zip", "piz", "rle", "tiles", "none", "png", "hdr", "lzw.tif", "tile.tif" };
+static const char *const sample_kinds[] = { "zip", "piz", "rle",     "tiles",   "none",
+                                            "png", "hdr", "lzw.tif", "tile.tif" };
 enum { N_SAMPLE_KINDS = sizeof(sample_kinds) / sizeof(sample_kinds[0]) };
 
 static int read_exactly(struct image *image, const uint8_t *bytes, size_t n)
@@ -1003,8 +1113,8 @@ static void every_truncation_is_refused_with_one_line(void **state)
                 continue;
             }
             if (logged.n_errors != 1 || image.data)
-                fail_msg("%s cut to %zu of %zu bytes: %d lines: %s", sample_kinds[k], length, n, logged.n_errors,
-                         logged.last);
+                fail_msg("%s cut to %zu of %zu bytes: %d lines: %s", sample_kinds[k], length, n,
+                         logged.n_errors, logged.last);
         }
         image_free(&whole);
         free(bytes);
@@ -1014,7 +1124,9 @@ static void every_truncation_is_refused_with_one_line(void **state)
 static void half_a_picture_is_never_taken_for_a_whole_one(void **state)
 {
     (void)state;
-    static const char *const kinds[] = { "zip", "piz", "rle", "none", "png", "hdr" }; // their last bytes are pixels or the end mark
+    static const char *const kinds[] = {
+        "zip", "piz", "rle", "none", "png", "hdr"
+    }; // their last bytes are pixels or the end mark
     for (size_t k = 0; k < sizeof(kinds) / sizeof(kinds[0]); k++) {
         uint8_t *bytes;
         size_t n;
@@ -1022,6 +1134,23 @@ static void half_a_picture_is_never_taken_for_a_whole_one(void **state)
         make_sample(kinds[k], &bytes, &n);
         assert_int_not_equal(read_exactly(&image, bytes, n - 1), 0);
         assert_int_not_equal(read_exactly(&image, bytes, n / 2), 0);
+        free(bytes);
+    }
+}
+
+static void damaged_pixels_of_a_tiff_are_named_by_their_place(void **state)
+{
+    (void)state;
+    static const char *const kinds[] = { "deflate.tif", "lzw.tif", "tile.tif" };
+    for (int k = 0; k < 3; k++) {
+        uint8_t *bytes;
+        size_t n;
+        struct image image;
+        make_sample(kinds[k], &bytes, &n);
+        memset(bytes + 8 + 20, 0xff, 60); // the pixels follow the header of 8 bytes
+        assert_int_equal(read_exactly(&image, bytes, n), -EINVAL);
+        assert_logged("memory", k == 2 ? "tile at column 0, row 0" : ": row ");
+        assert_null(image.data);
         free(bytes);
     }
 }
@@ -1045,7 +1174,8 @@ static void no_damaged_byte_crashes_a_reader(void **state)
                 else
                     image_free(&image);
                 if (err ? logged.n_errors != 1 : logged.n_errors != 0)
-                    fail_msg("%s, byte %zu: %d lines: %s", sample_kinds[k], i, logged.n_errors, logged.last);
+                    fail_msg("%s, byte %zu: %d lines: %s", sample_kinds[k], i, logged.n_errors,
+                             logged.last);
                 bytes[i] ^= masks[m];
             }
         assert_true(n_refused > 0);
@@ -1075,9 +1205,10 @@ static void what_is_no_picture_is_named(void **state)
     assert_logged("memory", "OpenEXR");
 }
 
-// ---- writing fails cleanly ------------------------------------------------------------------------------------------------
+// ---- writing fails cleanly ------------------------------------------------------------------
 
-// In a child that may not write files over limit bytes: what a full disk does. 0 if image_write_* failed as it should.
+// In a child that may not write files over limit bytes: what a full disk does. 0 if image_write_*
+// failed as it should.
 static int write_on_full_disk(const struct image *image, const char *path, bool png)
 {
     const pid_t child = fork();
@@ -1085,7 +1216,8 @@ static int write_on_full_disk(const struct image *image, const char *path, bool 
         signal(SIGXFSZ, SIG_IGN);
         setrlimit(RLIMIT_FSIZE, &(struct rlimit){ 2000, 2000 });
         listen();
-        const int err = png ? image_write_png_srgb(image, path, 0) : image_write_exr(image, path, IMAGE_FLOAT, IMAGE_ZIP);
+        const int err = png ? image_write_png_srgb(image, path, 0)
+                            : image_write_exr(image, path, IMAGE_FLOAT, IMAGE_ZIP);
         _exit(err == -EFBIG && logged.n_errors == 1 && strstr(logged.last, path) ? 0 : 1);
     }
     int status = 1;
@@ -1107,10 +1239,12 @@ static void a_write_that_fails_leaves_the_old_file_and_nothing_else(void **state
     image_free(&back);
 
     listen();
-    assert_int_equal(image_write_exr(&small, in_folder("no/such/folder.exr"), IMAGE_HALF, IMAGE_ZIP), -ENOENT);
+    assert_int_equal(
+        image_write_exr(&small, in_folder("no/such/folder.exr"), IMAGE_HALF, IMAGE_ZIP), -ENOENT);
     assert_logged("no/such/folder.exr", "create its folder");
     listen();
-    assert_int_equal(image_write_exr(&small, in_folder("keep.exr/below.exr"), IMAGE_HALF, IMAGE_ZIP), -ENOTDIR);
+    assert_int_equal(
+        image_write_exr(&small, in_folder("keep.exr/below.exr"), IMAGE_HALF, IMAGE_ZIP), -ENOTDIR);
     assert_logged("below.exr");
     listen();
     assert_int_equal(image_write_exr(&small, folder, IMAGE_HALF, IMAGE_ZIP), -EISDIR);
@@ -1123,7 +1257,7 @@ static void a_write_that_fails_leaves_the_old_file_and_nothing_else(void **state
     image_free(&small);
 }
 
-// ---- images in memory -----------------------------------------------------------------------------------------------------
+// ---- images in memory -----------------------------------------------------------------------
 
 static void new_images_are_zeroed_named_and_limited(void **state)
 {
@@ -1140,8 +1274,9 @@ static void new_images_are_zeroed_named_and_limited(void **state)
     assert_int_equal(image_new(&image, 1, 1, 1, NULL), 0);
     assert_string_equal(image.names[0], "Y");
     image_free(&image);
-    static const int bad[][3] = { { 0, 1, 1 }, { 1, -1, 1 }, { 65537, 1, 1 }, { 1, 65537, 1 }, { 65536, 4097, 1 },
-                                  { 1, 1, 0 }, { 1, 1, 65 }, { 1, 1, 2 }, { 1, 1, 5 } };
+    static const int bad[][3] = { { 0, 1, 1 },     { 1, -1, 1 },       { 65537, 1, 1 },
+                                  { 1, 65537, 1 }, { 65536, 4097, 1 }, { 1, 1, 0 },
+                                  { 1, 1, 65 },    { 1, 1, 2 },        { 1, 1, 5 } };
     for (size_t i = 0; i < sizeof(bad) / sizeof(bad[0]); i++) {
         assert_int_equal(image_new(&image, bad[i][0], bad[i][1], bad[i][2], NULL), -EINVAL);
         assert_null(image.data);
@@ -1162,14 +1297,17 @@ static void bilinear_is_exact_at_centres_linear_between_and_clamped(void **state
     assert_int_equal(image_new(&image, 4, 3, 2, (const char *const[]){ "u", "v" }), 0);
     for (int y = 0; y < 3; y++)
         for (int x = 0; x < 4; x++)
-            image.data[(y * 4 + x) * 2] = (float)(x + 8 * y), image.data[(y * 4 + x) * 2 + 1] = (float)(x * y);
+            image.data[(y * 4 + x) * 2] = (float)(x + 8 * y),
+                                     image.data[(y * 4 + x) * 2 + 1] = (float)(x * y);
     for (double y = .5; y <= 2.5; y += .25)
         for (double x = .5; x <= 3.5; x += .25) {
             image_bilinear(&image, x, y, out);
             assert_true(out[0] == (float)(x - .5 + 8 * (y - .5)));
-            assert_true(fabs((double)out[1] - (x - .5) * (y - .5)) < 1e-6); // bilinear functions come out exactly
+            assert_true(fabs((double)out[1] - (x - .5) * (y - .5)) <
+                        1e-6); // bilinear functions come out exactly
         }
-    static const double outside[][2] = { { -5, -5 }, { 99, -1 }, { -1, 99 }, { 1e300, 1e300 }, { 0, 0 }, { NAN, 99 } };
+    static const double outside[][2] = { { -5, -5 },       { 99, -1 }, { -1, 99 },
+                                         { 1e300, 1e300 }, { 0, 0 },   { NAN, 99 } };
     static const float corners[] = { 0, 3, 16, 19, 0, 16 };
     for (int i = 0; i < 6; i++) {
         image_bilinear(&image, outside[i][0], outside[i][1], out);
@@ -1178,7 +1316,7 @@ static void bilinear_is_exact_at_centres_linear_between_and_clamped(void **state
     image_free(&image);
 }
 
-// ---- real files -----------------------------------------------------------------------------------------------------------
+// ---- real files -----------------------------------------------------------------------------
 
 static void real_panoramas_and_views_read_with_plausible_light(void **state)
 {
@@ -1262,6 +1400,7 @@ int main(void)
         cmocka_unit_test(tone_mapped_png_follows_the_srgb_curve),
         cmocka_unit_test(every_truncation_is_refused_with_one_line),
         cmocka_unit_test(half_a_picture_is_never_taken_for_a_whole_one),
+        cmocka_unit_test(damaged_pixels_of_a_tiff_are_named_by_their_place),
         cmocka_unit_test(no_damaged_byte_crashes_a_reader),
         cmocka_unit_test(what_is_no_picture_is_named),
         cmocka_unit_test(a_write_that_fails_leaves_the_old_file_and_nothing_else),

@@ -1,4 +1,5 @@
-// tests/fuzz/fuzz_json.c - hostile JSON: an error, or a tree that every getter can walk and that survives a round trip.
+// tests/fuzz/fuzz_json.c - hostile JSON: an error, or a tree that every getter can walk and that
+// survives a round trip.
 #include "solver/take/json.h"
 #include "solver/take/log.h"
 
@@ -9,7 +10,9 @@
 int LLVMFuzzerTestOneInput(const uint8_t *bytes, size_t n);
 int LLVMFuzzerTestOneInput(const uint8_t *bytes, size_t n)
 {
-    static const char *const paths[] = { "", "0", "a", "a.0", "a.b", "lights.3.dir_probe", "0.0.0", ".", "..", "a.", "99999999999" };
+    static const char *const paths[] = {
+        "", "0", "a", "a.0", "a.b", "lights.3.dir_probe", "0.0.0", ".", "..", "a.", "99999999999"
+    };
     struct json *doc, *again;
     log_set_level(LOG_SILENT);
     if (json_parse(&doc, (const char *)bytes, n, "fuzz")) {
