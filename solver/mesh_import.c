@@ -158,7 +158,7 @@ static int check_obj_face(struct obj *o, const char *at, const char *end)
     return 0;
 }
 
-static int check_obj(const struct mesh_file *f)
+static int check_obj(struct mesh_file *f)
 {
     struct obj o = { .file = f };
     const char *at = f->bytes, *end = f->bytes + f->n_bytes;
@@ -197,6 +197,21 @@ static int check_obj(const struct mesh_file *f)
         log_warning("mesh: %s: no face uses the last %" PRId64 " of %" PRId64 " vertices: was the file cut short?", f->path,
                     o.n[0] - o.highest[0], o.n[0]);
     return 0;
+}
+
+// assimp takes ".5" for no number: the same text with "0.5" in such places, malloc'd. NULL without memory.
+static char *obj_with_leading_zeros(const struct mesh_file *f, size_t *n_bytes)
+{
+    char *out = malloc(f->n_bytes + f->n_bytes / 3 + 1); // " .5": one more for every three, at most
+    size_t n = 0;
+    for (size_t i = 0; i < f->n_bytes && out; i++) {
+        const char *c = f->bytes + i; // c[1] is there: a NUL ends the bytes
+        if (*c == '.' && i > 0 && is_blank(c[-1]) && c[1] >= '0' && c[1] <= '9')
+            out[n++] = '0';
+        out[n++] = *c;
+    }
+    *n_bytes = n;
+    return out;
 }
 
 // ---- PLY ----------------------------------------------------------------------------------------------------------------
@@ -376,7 +391,7 @@ cut_short:
                   " announced: the file is cut short or broken", p->at - p->file->bytes, e->name, i + 1, e->count);
 }
 
-static int check_ply(const struct mesh_file *f)
+static int check_ply(struct mesh_file *f)
 {
     struct ply *p = calloc(1, sizeof(*p));
     if (!p)
@@ -508,10 +523,28 @@ static int check_gltf_attribute(const struct mesh_file *f, const struct json *do
     return strcmp(found, type) ? refuse(f, -EINVAL, "%s: %s is %s; expected %s", primitive, name, found, type) : 0;
 }
 
-static int check_gltf_meshes(const struct mesh_file *f, const struct json *doc)
+// How many triangles a primitive promises.
+static int64_t gltf_triangles(const struct json *doc, const char *primitive)
 {
+    char path[192];
+    int64_t mode = 4, accessor = -1;
+    snprintf(path, sizeof(path), "%s.mode", primitive);
+    if (json_get(doc, path) && json_get_int(doc, path, &mode))
+        return 0;
+    snprintf(path, sizeof(path), "%s.indices", primitive);
+    if (!json_get(doc, path))
+        snprintf(path, sizeof(path), "%s.attributes.POSITION", primitive);
+    if (json_get_int(doc, path, &accessor) || accessor < 0)
+        return 0;
+    const int64_t n = gltf_int(doc, "accessors", accessor, "count", 0, 1 << 28);
+    return mode == 4 ? n / 3 : (mode == 5 || mode == 6) && n > 2 ? n - 2 : 0;
+}
+
+static int check_gltf_meshes(struct mesh_file *f, const struct json *doc)
+{
+    f->n_promised = 0;
     for (int64_t i = 0; i < gltf_length(doc, "meshes"); i++) {
-        char path[160];
+        char path[96]; // far longer than two numbers need
         snprintf(path, sizeof(path), "meshes.%" PRId64 ".primitives", i);
         for (int64_t k = 0, n = gltf_length(doc, path); k < n; k++) {
             snprintf(path, sizeof(path), "meshes.%" PRId64 ".primitives.%" PRId64, i, k);
@@ -522,6 +555,7 @@ static int check_gltf_meshes(const struct mesh_file *f, const struct json *doc)
                 err = check_gltf_attribute(f, doc, path, "TEXCOORD_0", "VEC2", false);
             if (err)
                 return err;
+            f->n_promised += gltf_triangles(doc, path);
         }
     }
     return 0;
@@ -563,7 +597,7 @@ static int check_gltf_nodes(const struct mesh_file *f, const struct json *doc)
 }
 
 // A buffer's own bytes are looked for by assimp (a file beside, base64 text), except a GLB's BIN chunk: n_bin.
-static int check_gltf_json(const struct mesh_file *f, const char *text, size_t n_text, int64_t n_bin)
+static int check_gltf_json(struct mesh_file *f, const char *text, size_t n_text, int64_t n_bin)
 {
     struct json *doc;
     int err = json_parse(&doc, text, n_text, f->path);
@@ -600,12 +634,12 @@ static int check_gltf_json(const struct mesh_file *f, const char *text, size_t n
     return err;
 }
 
-static int check_gltf(const struct mesh_file *f)
+static int check_gltf(struct mesh_file *f)
 {
     return check_gltf_json(f, f->bytes, f->n_bytes, 0);
 }
 
-static int check_glb(const struct mesh_file *f)
+static int check_glb(struct mesh_file *f)
 {
     static const uint32_t json_chunk = 0x4e4f534a, bin_chunk = 0x004e4942;
     if (f->n_bytes < 20)
@@ -679,21 +713,23 @@ static bool is_obj(const struct mesh_file *f)
 static const struct {
     const char *alias; // the name assimp gets to see
     bool (*probe)(const struct mesh_file *f);
-    int (*check)(const struct mesh_file *f);
-    bool has_buffers; // may open files beside it
+    int (*check)(struct mesh_file *f);
+    char *(*rewrite)(const struct mesh_file *f, size_t *n_bytes); // NULL: assimp takes the bytes as they are
+    bool has_buffers;                                             // may open files beside it
 } formats[] = {
-    { "mesh.glb", is_glb, check_glb, true },
-    { "mesh.ply", is_ply, check_ply, false },
-    { "mesh.gltf", is_gltf, check_gltf, true },
-    { "mesh.obj", is_obj, check_obj, false },
+    { "mesh.glb", is_glb, check_glb, NULL, true },
+    { "mesh.ply", is_ply, check_ply, NULL, false },
+    { "mesh.gltf", is_gltf, check_gltf, NULL, true },
+    { "mesh.obj", is_obj, check_obj, obj_with_leading_zeros, false },
 };
 enum { N_FORMATS = sizeof(formats) / sizeof(formats[0]) };
 
-int mesh_check_file(const struct mesh_file *f, int *format)
+int mesh_check_file(struct mesh_file *f, int *format)
 {
     for (int i = 0; i < N_FORMATS; i++)
         if (formats[i].probe(f)) {
             *format = i;
+            f->n_promised = -1;
             return formats[i].check(f);
         }
     return refuse(f, f->n_bytes ? -ENOTSUP : -EINVAL, f->n_bytes ? "not a known mesh format; expected OBJ, PLY, glTF or GLB"
@@ -949,6 +985,18 @@ static int count_mesh(void *arg, const struct aiMesh *mesh, const double world[1
     return t->n_triangles > MAX_TRIANGLES || t->n_vertices > 3 * (int64_t)MAX_TRIANGLES ? -EFBIG : 0;
 }
 
+// assimp leaves out faces whose indices are out of range, without a word.
+static int check_promise(const struct mesh_file *f, const struct aiScene *scene)
+{
+    int64_t n = 0;
+    for (unsigned i = 0; i < scene->mNumMeshes; i++)
+        for (unsigned k = 0; k < scene->mMeshes[i]->mNumFaces; k++)
+            n += scene->mMeshes[i]->mFaces[k].mNumIndices == 3;
+    return f->n_promised < 0 || n == f->n_promised ? 0
+           : refuse(f, -EINVAL, "%" PRId64 " of %" PRId64 " triangles use vertices that do not exist", f->n_promised - n,
+                    f->n_promised);
+}
+
 struct adding {
     struct soup *soup;
     const struct mesh_file *file;
@@ -963,16 +1011,26 @@ static int add_visited(void *arg, const struct aiMesh *mesh, const double world[
 static int import(struct soup *s, const struct mesh_file *f, int format)
 {
     int err;
-    struct importing im = { f, format };
+    struct mesh_file shown = *f;
+    struct importing im = { &shown, format };
     struct aiFileIO io = { open_file, close_file, (char *)&im };
     struct totals totals = { 0, 0 };
     struct adding adding = { s, f };
+    char *rewritten = NULL;
+    if (formats[format].rewrite) {
+        rewritten = formats[format].rewrite(f, &shown.n_bytes);
+        if (!rewritten)
+            return -ENOMEM;
+        shown.bytes = rewritten;
+    }
     const struct aiScene *scene = aiImportFileEx(formats[format].alias, aiProcess_Triangulate, &io);
     if (!scene || !scene->mRootNode || (scene->mFlags & AI_SCENE_FLAGS_INCOMPLETE && !scene->mNumMeshes)) {
         err = refuse(f, -EINVAL, "%s", scene ? "no triangles" : aiGetErrorString());
         goto done;
     }
-    err = walk_nodes(scene, count_mesh, &totals);
+    err = check_promise(f, scene);
+    if (!err)
+        err = walk_nodes(scene, count_mesh, &totals);
     if (err == -EFBIG) {
         refuse(f, err, "more than %d triangles; reduce the mesh", MAX_TRIANGLES);
         goto done;
@@ -990,6 +1048,7 @@ static int import(struct soup *s, const struct mesh_file *f, int format)
         err = refuse(f, -EINVAL, "no UVs: none of %" PRId64 " triangles has any; unwrap the mesh before export",
                      s->n_triangles);
 done:
+    free(rewritten);
     aiReleaseImport(scene);
     return err;
 }
