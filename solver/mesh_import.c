@@ -19,6 +19,8 @@
 #include <stdarg.h>
 #include <stdlib.h>
 #include <string.h>
+#include <sys/stat.h>
+#include <unistd.h>
 
 enum { MAX_TRIANGLES = 1 << 26, GLTF_MAX_DEPTH = 256 };
 static const size_t max_file_bytes = (size_t)8 << 30;
@@ -596,7 +598,61 @@ static int check_gltf_nodes(const struct mesh_file *f, const struct json *doc)
     return err;
 }
 
-// A buffer's own bytes are looked for by assimp (a file beside, base64 text), except a GLB's BIN chunk: n_bin.
+// %20 and the like, in place.
+static void percent_decode(char *s)
+{
+    char *out = s;
+    for (; *s; s++) {
+        unsigned value;
+        if (s[0] == '%' && s[1] && s[2] && sscanf(s + 1, "%2x", &value) == 1 && value) {
+            *out++ = (char)value;
+            s += 2;
+        } else {
+            *out++ = *s;
+        }
+    }
+    *out = 0;
+}
+
+// name in the folder of path, as it is or (where there is no such file) percent-decoded. NULL without memory.
+static char *path_beside(const char *path, const char *name)
+{
+    const char *slash = strrchr(path, '/');
+    char *full;
+    if (asprintf(&full, "%.*s%s", slash ? (int)(slash + 1 - path) : 0, path, name) < 0)
+        return NULL;
+    if (access(full, F_OK))
+        percent_decode(full + (slash ? slash + 1 - path : 0));
+    return full;
+}
+
+// A GLB's own chunk, base64 text (assimp counts that), or a file beside: long enough for what is promised?
+static int check_gltf_buffer(const struct mesh_file *f, const struct json *doc, int64_t i, int64_t n_bytes, int64_t n_bin)
+{
+    char path[64];
+    const char *uri;
+    struct stat st;
+    if (n_bytes < 0)
+        return refuse(f, -EINVAL, "buffer %" PRId64 ": byteLength is missing or out of range", i);
+    snprintf(path, sizeof(path), "buffers.%" PRId64 ".uri", i);
+    if (json_get_string(doc, path, &uri)) {
+        const int64_t n_there = i == 0 ? n_bin : 0;
+        return n_bytes <= n_there ? 0 : refuse(f, -EINVAL, "buffer %" PRId64 " has %" PRId64 " bytes, the BIN chunk %" PRId64
+                                               ": the file is cut short or broken", i, n_bytes, n_there);
+    }
+    if (!strncmp(uri, "data:", 5))
+        return 0;
+    char *full = path_beside(f->path, uri);
+    int err = full ? 0 : -ENOMEM;
+    if (full && stat(full, &st))
+        err = refuse(f, -EINVAL, "buffer %" PRId64 " is the file '%s': %s", i, full, strerror(errno));
+    else if (full && st.st_size < n_bytes)
+        err = refuse(f, -EINVAL, "buffer %" PRId64 " is the file '%s' of %" PRId64 " bytes; expected %" PRId64
+                     ": it is cut short", i, full, (int64_t)st.st_size, n_bytes);
+    free(full);
+    return err;
+}
+
 static int check_gltf_json(struct mesh_file *f, const char *text, size_t n_text, int64_t n_bin)
 {
     struct json *doc;
@@ -605,15 +661,13 @@ static int check_gltf_json(struct mesh_file *f, const char *text, size_t n_text,
         return err;
     err = check_gltf_extensions(f, doc);
     const int64_t n_buffers = gltf_length(doc, "buffers");
+    int64_t n_total = 0;
     for (int64_t i = 0; i < n_buffers && !err; i++) {
-        char path[64];
         const int64_t n_bytes = gltf_int(doc, "buffers", i, "byteLength", -1, INT64_C(1) << 40);
-        snprintf(path, sizeof(path), "buffers.%" PRId64 ".uri", i);
-        if (n_bytes < 0)
-            err = refuse(f, -EINVAL, "buffer %" PRId64 ": byteLength is missing or out of range", i);
-        else if (!json_get(doc, path) && (i > 0 || n_bytes > n_bin))
-            err = refuse(f, -EINVAL, "buffer %" PRId64 " has %" PRId64 " bytes, the BIN chunk %" PRId64 ": the file is cut short "
-                         "or broken", i, n_bytes, i > 0 ? 0 : n_bin);
+        err = check_gltf_buffer(f, doc, i, n_bytes, n_bin);
+        n_total += n_bytes; // many buffers may name one file
+        if (!err && n_total > (int64_t)max_file_bytes)
+            err = refuse(f, -EFBIG, "buffers of more than %zu bytes", max_file_bytes);
     }
     for (int64_t i = 0; i < gltf_length(doc, "bufferViews") && !err; i++) {
         const int64_t buffer = gltf_int(doc, "bufferViews", i, "buffer", -1, n_buffers - 1);
@@ -739,9 +793,11 @@ int mesh_check_file(struct mesh_file *f, int *format)
 // ---- assimp -------------------------------------------------------------------------------------------------------------
 
 struct opened { // a file that assimp has open
+    struct aiFile file;
     char *owned;
     const char *bytes;
     size_t n_bytes, at;
+    struct opened *next;
 };
 
 static size_t read_bytes(struct aiFile *file, char *out, size_t size, size_t count)
@@ -789,64 +845,40 @@ static void flush_nothing(struct aiFile *file)
 struct importing {
     const struct mesh_file *file;
     int format;
+    struct opened *all; // assimp forgets to close files when it gives up
 };
-
-// %20 and the like, in place.
-static void percent_decode(char *s)
-{
-    char *out = s;
-    for (; *s; s++) {
-        unsigned value;
-        if (s[0] == '%' && sscanf(s + 1, "%2x", &value) == 1 && s[1] && s[2] && value) {
-            *out++ = (char)value;
-            s += 2;
-        } else {
-            *out++ = *s;
-        }
-    }
-    *out = 0;
-}
 
 static int read_beside(struct opened *o, const char *path, const char *name)
 {
-    const char *slash = strrchr(path, '/');
-    char *full;
-    if (asprintf(&full, "%.*s%s", slash ? (int)(slash + 1 - path) : 0, path, name) < 0)
-        return -ENOMEM;
-    int err = whole_file_read(&o->owned, &o->n_bytes, full, max_file_bytes);
-    if (err == -ENOENT && strchr(name, '%')) {
-        percent_decode(full);
-        err = whole_file_read(&o->owned, &o->n_bytes, full, max_file_bytes);
-    }
+    char *full = path_beside(path, name);
+    const int err = full ? whole_file_read(&o->owned, &o->n_bytes, full, max_file_bytes) : -ENOMEM;
     if (err)
-        log_error("mesh: %s: cannot read its buffer %s: %s", path, full, strerror(-err));
+        log_error("mesh: %s: cannot read its buffer %s: %s", path, name, strerror(-err));
     free(full);
     return err;
 }
 
 static struct aiFile *open_file(struct aiFileIO *io, const char *name, const char *mode)
 {
-    const struct importing *im = (const struct importing *)io->UserData;
+    struct importing *im = (struct importing *)io->UserData;
     (void)mode;
-    struct aiFile *file = calloc(1, sizeof(*file));
     struct opened *o = calloc(1, sizeof(*o));
-    if (!file || !o)
-        goto fail;
+    if (!o)
+        return NULL;
     while (!strncmp(name, "./", 2))
         name += 2;
     if (!strcmp(name, formats[im->format].alias)) {
         o->bytes = im->file->bytes, o->n_bytes = im->file->n_bytes;
-    } else {
-        if (!formats[im->format].has_buffers || read_beside(o, im->file->path, name))
-            goto fail;
+    } else if (formats[im->format].has_buffers && !read_beside(o, im->file->path, name)) {
         o->bytes = o->owned;
+    } else {
+        free(o);
+        return NULL;
     }
-    *file = (struct aiFile){ read_bytes, write_nothing, tell, file_size, seek, flush_nothing, (char *)o };
-    return file;
-fail:
-    free(file);
-    free(o);
-    return NULL;
+    o->file = (struct aiFile){ read_bytes, write_nothing, tell, file_size, seek, flush_nothing, (char *)o };
+    o->next = im->all;
+    im->all = o;
+    return &o->file;
 }
 
 static void close_file(struct aiFileIO *io, struct aiFile *file)
@@ -854,8 +886,18 @@ static void close_file(struct aiFileIO *io, struct aiFile *file)
     (void)io;
     struct opened *o = (struct opened *)file->UserData;
     free(o->owned);
-    free(o);
-    free(file);
+    o->owned = NULL;
+    o->n_bytes = o->at = 0;
+}
+
+static void forget_files(struct importing *im)
+{
+    while (im->all) {
+        struct opened *o = im->all;
+        im->all = o->next;
+        free(o->owned);
+        free(o);
+    }
 }
 
 // What the scene's meshes become, before vertices are told apart.
@@ -1012,7 +1054,7 @@ static int import(struct soup *s, const struct mesh_file *f, int format)
 {
     int err;
     struct mesh_file shown = *f;
-    struct importing im = { &shown, format };
+    struct importing im = { &shown, format, NULL };
     struct aiFileIO io = { open_file, close_file, (char *)&im };
     struct totals totals = { 0, 0 };
     struct adding adding = { s, f };
@@ -1048,8 +1090,9 @@ static int import(struct soup *s, const struct mesh_file *f, int format)
         err = refuse(f, -EINVAL, "no UVs: none of %" PRId64 " triangles has any; unwrap the mesh before export",
                      s->n_triangles);
 done:
-    free(rewritten);
     aiReleaseImport(scene);
+    forget_files(&im);
+    free(rewritten);
     return err;
 }
 

@@ -493,14 +493,14 @@ static void broken_files_are_refused_with_their_place(void **state)
         { "ply\nformat ascii 1.0\nelement vertex 3\n", -EINVAL, "before end_header" },
         { "{\"asset\":", -EINVAL, "" },
         { GLTF(ONE_NODE, "", ""), -EINVAL, "buffer 0 has 92 bytes, the BIN chunk 0" },
-        { GLTF(ONE_NODE, "\"uri\":\"nowhere.bin\",", ""), -EINVAL, "" },
+        { GLTF(ONE_NODE, "\"uri\":\"nowhere.bin\",", ""), -EINVAL, "nowhere.bin': No such file" },
         { GLTF(ONE_NODE, "\"uri\":\"nowhere.bin\",", "\"extensionsRequired\":[\"KHR_draco_mesh_compression\"],"), -ENOTSUP,
           "KHR_draco_mesh_compression" },
         { GLTF(ONE_NODE, "\"uri\":\"nowhere.bin\",", "\"extensionsUsed\":[\"A\",\"EXT_meshopt_compression\"],"), -ENOTSUP,
           "EXT_meshopt_compression" },
-        { GLTF("\"nodes\":[{\"children\":[1]},{\"children\":[0]}]", "\"uri\":\"a\",", ""), -EINVAL, "within itself" },
-        { GLTF("\"nodes\":[{\"children\":[2]},{\"children\":[2]},{\"mesh\":0}]", "\"uri\":\"a\",", ""), -EINVAL, "a tree" },
-        { GLTF("\"nodes\":[{\"children\":[7]}]", "\"uri\":\"a\",", ""), -EINVAL, "does not exist" },
+        { GLTF("\"nodes\":[{\"children\":[1]},{\"children\":[0]}]", "\"uri\":\"data:,\",", ""), -EINVAL, "within itself" },
+        { GLTF("\"nodes\":[{\"children\":[2]},{\"children\":[2]},{\"mesh\":0}]", "\"uri\":\"data:,\",", ""), -EINVAL, "a tree" },
+        { GLTF("\"nodes\":[{\"children\":[7]}]", "\"uri\":\"data:,\",", ""), -EINVAL, "does not exist" },
     };
     for (size_t i = 0; i < sizeof(cases) / sizeof(cases[0]); i++) {
         struct mesh m;
