@@ -3,12 +3,15 @@
 VERSION := 0.1.0
 VARIANT ?= release
 PREFIX ?= /usr/local
-CC ?= gcc
+ifeq ($(origin CC),default)
+CC := gcc
+endif
+Q := $(if $(V),,@)
 BUILD := build$(if $(filter-out release,$(VARIANT)),/$(VARIANT))
 MACHINE := $(shell uname -m)
 
 # ---- packages (Debian 12; the same names in Debian 13) ----------------------------------------------------------------
-PACKAGES := gcc make pkg-config libopenexr-dev libembree-dev libassimp-dev libjansson-dev libtiff-dev libpng-dev libcmocka-dev perl
+PACKAGES := gcc make pkg-config libopenexr-dev libembree-dev libassimp-dev libjansson-dev libtiff-dev libpng-dev libcmocka-dev perl help2man
 PACKAGES_FUZZ := clang libclang-rt-dev
 PACKAGES_BENCH := libceres-dev g++ gnuplot-nox
 
@@ -30,7 +33,7 @@ endif
 
 # ---- what is built ------------------------------------------------------------------------------------------------------
 TAKE := $(addprefix solver/take/,atomic_file.c image.c image_exr.c image_hdr.c image_png.c image_tiff.c json.c log.c progress.c take.c)
-SOLVER := $(addprefix solver/,cameras.c cameras_colmap.c compare.c disney.c lights.c mesh.c mesh_import.c panorama.c parallel.c \
+SOLVER := $(addprefix solver/,cameras.c cameras_colmap.c compare.c csv.c disney.c lights.c mesh.c mesh_import.c panorama.c parallel.c \
   rays.c render.c shapes.c synth.c texels.c visibility.c)
 KERNELS := $(addprefix solver/kernels/,kernels.c kernels_ref.c kernels_portable.c kernels_avx2.c kernels_avx512.c)
 COMMANDS := $(addprefix solver/commands/,brdf.c compare.c lights.c render.c synth.c visibility.c)
@@ -40,34 +43,108 @@ FUZZERS := cameras csv exr hdr json lights mesh
 
 # ---- rules --------------------------------------------------------------------------------------------------------------
 have = $(wildcard $(1)) # files not written yet are left out
-LIBRARY_O := $(patsubst %.c,$(BUILD)/obj/%.o,$(call have,$(LIBRARY)))
-COMMANDS_O := $(patsubst %.c,$(BUILD)/obj/%.o,$(call have,$(COMMANDS)) solver/main.c)
-ifneq ($(filter test demo bench chart stability fuzz,$(MAKECMDGOALS)),)
-FIRST := deps
+object = $(patsubst %.c,$(BUILD)/obj/%.o,$(call have,$(1)))
+ifneq ($(filter test demo bench chart stability,$(MAKECMDGOALS)),)
+FIRST := deps # these four install what is missing before the first file is compiled
 endif
-
-all: $(BUILD)/bin/rigsolve
-.PHONY: all deps test demo bench chart stability fuzz check-includes install clean help man
+.PHONY: all deps deps-fuzz deps-bench test demo bench chart stability fuzz check-includes man install clean help
 .DELETE_ON_ERROR:
 .SECONDARY:
 
+all: $(BUILD)/bin/rigsolve
+
 $(BUILD)/obj/%.o: %.c Makefile | $(FIRST)
 	@mkdir -p $(@D)
-	$(CC) $(CFLAGS_ALL) $(ISA) -MMD -MP -c $< -o $@
+	@$(if $(V),,echo '  CC $<')
+	$(Q)$(CC) $(CFLAGS_ALL) $(ISA) -MMD -MP -c $< -o $@
+$(BUILD)/obj/%.o: %.cc Makefile | $(FIRST)
+	@mkdir -p $(@D)
+	@$(if $(V),,echo '  CXX $<')
+	$(Q)$(CXX) -std=c++17 -O3 -g -march=native -I. -I/usr/include/eigen3 -MMD -MP -c $< -o $@
 $(BUILD)/obj/solver/kernels/kernels_avx2.o: ISA := $(ISA_avx2)
 $(BUILD)/obj/solver/kernels/kernels_avx512.o: ISA := $(ISA_avx512)
-$(BUILD)/obj/solver/kernels/kernels_portable.o $(BUILD)/obj/solver/kernels/kernels_avx2.o $(BUILD)/obj/solver/kernels/kernels_avx512.o: \
-  FLAGS_release := -O3 -g
-$(BUILD)/libstudiorig.a: $(LIBRARY_O)
+$(BUILD)/obj/solver/kernels/kernels_%.o: FLAGS_release := -O3 -g
+$(BUILD)/libstudiorig.a: $(call object,$(LIBRARY))
 	@rm -f $@
-	ar rcsD $@ $^
-$(BUILD)/bin/rigsolve: $(COMMANDS_O) $(BUILD)/libstudiorig.a
+	@$(if $(V),,echo '  AR $@')
+	$(Q)ar rcsD $@ $^
+$(BUILD)/bin/rigsolve: $(call object,$(COMMANDS) solver/main.c) $(BUILD)/libstudiorig.a
 	@mkdir -p $(@D)
-	$(CC) $(CFLAGS_ALL) $^ $(LIBS) -o $@
+	@$(if $(V),,echo '  LD $@')
+	$(Q)$(CC) $(CFLAGS_ALL) $^ $(LIBS) -o $@
 $(BUILD)/tests/%: $(BUILD)/obj/tests/%.o $(BUILD)/libstudiorig.a
 	@mkdir -p $(@D)
-	$(CC) $(CFLAGS_ALL) $^ -lcmocka $(LIBS) -o $@
+	@$(if $(V),,echo '  LD $@')
+	$(Q)$(CC) $(CFLAGS_ALL) $^ -lcmocka $(LIBS) -o $@
+$(BUILD)/fuzz/%: tests/fuzz/%.c $(call have,$(LIBRARY)) Makefile | deps-fuzz
+	@mkdir -p $(@D)
+	@$(if $(V),,echo '  FUZZ $<')
+	$(Q)clang $(FUZZ_FLAGS) $< $(call have,$(FUZZED)) $(LIBS) -o $@
 
+# dpkg-query knows what is there; apt-get is asked only for what is not.
+install_packages = @missing=$$(for p in $(1); do dpkg-query -W -f='$${Status}\n' $$p 2>/dev/null | grep -q 'ok installed' || echo $$p; done); \
+  if [ -n "$$missing" ]; then echo "deps: installing" $$missing; \
+    command -v apt-get >/dev/null || { echo "deps: no apt-get here: install the packages named above by hand" >&2; exit 1; }; \
+    SUDO=; [ "$$(id -u)" = 0 ] || { command -v sudo >/dev/null && SUDO=sudo || { echo "deps: not root and no sudo: run as root: apt-get install" $$missing >&2; exit 1; }; }; \
+    $$SUDO apt-get update -qq && DEBIAN_FRONTEND=noninteractive $$SUDO apt-get install -y -qq --no-install-recommends $$missing >/dev/null || \
+      { echo "deps: apt-get failed: run it by hand to see why: apt-get install" $$missing >&2; exit 1; }; echo "deps: done"; fi
+deps: ; $(call install_packages,$(PACKAGES))
+deps-fuzz: ; $(call install_packages,$(PACKAGES_FUZZ))
+deps-bench: deps ; $(call install_packages,$(PACKAGES_BENCH))
+
+# ---- tests ----------------------------------------------------------------------------------------------------------------
+TEST_PROGRAMS := $(patsubst tests/%.c,$(BUILD)/tests/%,$(call have,$(addprefix tests/,$(addsuffix .c,$(TESTS)))))
+test: deps $(BUILD)/bin/rigsolve $(TEST_PROGRAMS)
+	@CMOCKA_MESSAGE_OUTPUT=TAP BIN=$(BUILD)/bin $(TEST_ENV) prove --timer --merge --exec '' tests/check_includes.sh $(TEST_PROGRAMS) tests/test_commands.sh
+check-includes:
+	@prove --exec '' tests/check_includes.sh
+TEST_ENV_asan := ASAN_OPTIONS=detect_leaks=1:allocator_may_return_null=1 LSAN_OPTIONS=suppressions=tests/lsan.supp:print_suppressions=0
+TEST_ENV_tsan := TSAN_OPTIONS=suppressions=tests/tsan.supp:halt_on_error=1
+TEST_ENV = $(TEST_ENV_$(VARIANT))
+
+FUZZ_SECONDS ?= 60
+FUZZ_FLAGS = -std=gnu11 -D_GNU_SOURCE -O1 -g -fsanitize=fuzzer,address,undefined -fno-sanitize-recover=undefined -pthread -I. \
+  -I/usr/include/OpenEXR -I/usr/include/Imath -DSTUDIORIG_VERSION='"$(VERSION)"'
+FUZZED := $(TAKE) $(filter-out %/render.c %/synth.c,$(SOLVER))
+FUZZ_PROGRAMS := $(patsubst tests/%.c,$(BUILD)/%,$(call have,$(patsubst %,tests/fuzz/fuzz_%.c,$(FUZZERS))))
+fuzz: deps deps-fuzz $(FUZZ_PROGRAMS)
+	@printf '%s\n' $(FUZZ_PROGRAMS) | xargs -P 2 -I{} sh tests/fuzz/run.sh {} $(FUZZ_SECONDS)
+
+# ---- demonstration, measurements ------------------------------------------------------------------------------------------
+demo: deps $(BUILD)/bin/rigsolve
+	@BIN=$(BUILD)/bin sh tests/demo.sh build/demo
+
+BENCH_PROGRAMS := $(patsubst tests/bench/%.c,$(BUILD)/tests/bench/%,$(call have,$(wildcard tests/bench/*.c)))
+$(BUILD)/tests/bench/bench_kernels: $(if $(wildcard /usr/include/ceres/jet.h),$(BUILD)/obj/tests/bench/ceres_peer.o)
+bench: deps $(BENCH_PROGRAMS) $(BUILD)/bin/rigsolve
+	@for b in kernels rays synth; do echo "== bench_$$b"; $(BUILD)/tests/bench/bench_$$b || exit 1; done
+chart: deps deps-bench $(BUILD)/tests/bench/chart_lights
+	@mkdir -p build/chart && $(BUILD)/tests/bench/chart_lights >build/chart/lights.csv && gnuplot -e "out='build/chart/lights'" tests/bench/chart_lights.gp
+	@echo "chart: build/chart/lights.csv .svg .png: seconds against error over N, roughness and kernel"
+stability: deps deps-bench $(BUILD)/tests/bench/stability_kernels
+	@mkdir -p build/stability && $(BUILD)/tests/bench/stability_kernels >build/stability/kernels.csv && gnuplot -e "out='build/stability/kernels'" tests/bench/stability_kernels.gp
+	@echo "stability: build/stability/kernels.csv .svg .png: where float32 fails, over roughness and elevation"
+
+# ---- installation ---------------------------------------------------------------------------------------------------------
+MAN := $(addprefix $(BUILD)/man/rigsolve,.1 $(addprefix -,$(addsuffix .1,$(notdir $(COMMANDS:.c=)))))
+man: $(MAN)
+$(BUILD)/man/rigsolve.1: $(BUILD)/bin/rigsolve
+	@mkdir -p $(@D)
+	$(Q)help2man -N -n 'from photographs in a studio to relightable materials' -o $@ $<
+$(BUILD)/man/rigsolve-%.1: $(BUILD)/bin/rigsolve
+	@mkdir -p $(@D)
+	$(Q)help2man -N -n 'rigsolve $*' --version-string=$(VERSION) -o $@ "$< $*"
+install: $(BUILD)/bin/rigsolve $(MAN)
+	install -D -m 755 $(BUILD)/bin/rigsolve $(DESTDIR)$(PREFIX)/bin/rigsolve
+	install -D -m 644 -t $(DESTDIR)$(PREFIX)/share/man/man1 $(MAN)
+	install -D -m 644 config/completion/rigsolve.bash $(DESTDIR)$(PREFIX)/share/bash-completion/completions/rigsolve
+	install -D -m 644 -t $(DESTDIR)$(PREFIX)/share/doc/studiorig README.md LICENSE solver/NOTATION.md
 clean:
 	rm -rf build
+help:
+	@echo 'make            build/bin/rigsolve                make test      everything that must hold (installs packages)'
+	@echo 'make demo       a synthetic studio, end to end    make fuzz      libFuzzer on every parser (FUZZ_SECONDS=60)'
+	@echo 'make bench      seconds and errors of kernels     make chart     speed against accuracy      make stability  where it fails'
+	@echo 'make install    DESTDIR= PREFIX=/usr/local        make deps      Debian packages             make clean'
+	@echo 'variants: VARIANT=debug|asan|tsan; V=1 shows commands'
 -include $(shell find $(BUILD)/obj -name '*.d' 2>/dev/null)

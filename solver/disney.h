@@ -31,9 +31,8 @@ struct disney_frame {
 void disney_eval(const struct disney *m, const struct disney_frame *frame, const double l[3],
                  const double v[3], double f[3]);
 
-// Derivatives are of the formula as written in SOLVER.md 2 (each entry names its convention for unit vectors: see disney.c):
-// by theta and albedo at fixed directions; by l and n with the vector's three components taken as free and h = (l+v)/|l+v|
-// following l; tangents do not follow n.
+// Derivatives by theta and albedo are at fixed directions (clamps and black albedo: see disney.c). Those by l and n are for unit
+// vectors that turn: the gradient lies in the plane across the vector. h follows l; x and y follow n by the smallest rotation.
 struct disney_gradient {
     double f[3];
     double theta[3][DISNEY_N];

@@ -24,22 +24,31 @@ struct lights {
     int32_t *group;             // [n] emitter, -1: none
 };
 
+enum { LIGHTS_MAX = 65536 };
+
 // Zeroed set-up: c = 0, R = identity, all directional, no group. 0 or -ENOMEM.
 int lights_new(struct lights *out, int n);
 void lights_free(struct lights *l); // leaves it zeroed
 
-// Median cut (Debevec 2005): n = 2^k regions, 1 <= n <= 65536, that partition the panorama; each is split along its longer side
-// (width x cos(elevation of its centre)) where the luminance x solid angle halves. A region that cannot be split (one pixel, or
-// no energy) gives an empty light (irradiance 0). Total energy is kept. 0, -EINVAL (n), -ENOMEM.
+// Median cut (Debevec 2005): n = 2^k regions, 1 <= n <= LIGHTS_MAX, that partition the panorama; each is split along its longer
+// side (width x cos(elevation of its centre)) where the luminance (Rec. 709) x solid angle halves. Total energy is kept.
+// A region that cannot be split (one pixel, or no energy) gives one light, and empty ones in place of its parts: irradiance 0,
+// no pixels (x0 = x1), the *same* direction. Lights are in the order of the cut: any aligned run of 2^j of them is one region of
+// the cut into n / 2^j, so neighbours in the list are neighbours in the sky. 0, -EINVAL (n; logged), -ENOMEM.
 int lights_median_cut(struct lights *out, const struct panorama *p, int n);
 
-// lights.json (FORMAT: DESIGN.md 6): {format, panorama:{width,height}, centre_m, world_from_probe, lights:[{dir_probe, irradiance,
-// distance_m (null = directional), pos_m, group, region}]}. Reading checks ranges; errors are logged, -EINVAL.
+// lights.json (DESIGN.md 6): {format: "studiorig-lights-1", panorama: {width, height} (optional), centre_m, world_from_probe,
+// lights: [{dir_probe, irradiance, distance_m (null = directional), pos_m (optional; agrees with the rest), group (-1: none),
+// region: [x0, y0, x1, y1], spread_rad (both optional, but of all lights or none)}]}.
+// Every bit survives a round trip, but for the last one of 1/r. Reading checks ranges: directions unit and the rotation
+// orthonormal to 1e-6, irradiance in [0, 1e30]. Errors are logged: -EINVAL, -ENOMEM, those of json_read.
 int lights_write_json(const struct lights *l, const char *path);
 int lights_read_json(struct lights *out, const char *path);
+int lights_parse_json(struct lights *out, const char *text, size_t n_bytes, const char *name_for_errors);
 
 // Irradiance that light i gives a surface at p facing it, and where it comes from (Eqs. 1-4), written so that q = 1/r = 0 is
 // an ordinary value: u = R dh + q (c - p);  l = u/|u|;  c_i(p) = max(<u, R dh>, 0) / |u|^3 C_i.
+// Behind the light (<u, R dh> <= 0) and at its very place the weight and all derivatives are 0; l stays a unit vector.
 struct light_at {
     double l[3];   // unit direction to the light
     double weight; // c_i(p) = weight * C_i

@@ -21,9 +21,11 @@ struct render_material {
 
 struct render_settings {
     int samples;          // per pixel side: samples^2 rays on a regular grid (box filter)
+    bool shade_every_sample; // false: where all samples lie on one smooth piece of one material, the pixel is shaded once, at its
+                          // centre, with the samples' mean albedo (an error of second order in the pixel's size)
     bool shadows;
-    int shadow_rays;      // 0: one ray per light; else lights are put in groups of neighbours and this many rays per group
-                          // are spent on lights drawn by their energy (an unbiased estimate; seed decides)
+    int shadow_rays;      // 0: one ray per light; else lights are put in <= 256 groups of neighbours, this many rays per group
+                          // are spent on lights drawn by their energy, and the share that arrives scales the group (seed decides)
     int bounce_rays;      // 0: no indirect light; else diffuse interreflection gathered with this many rays per sample
     int bounce_texture;   // size of the radiosity texture (e.g. 256)
     uint64_t seed;
@@ -31,7 +33,8 @@ struct render_settings {
 };
 
 struct renderer;
-// Keeps pointers to mesh, rays, lights, material until renderer_free(). Precomputes the radiosity texture when bouncing.
+// Keeps pointers to mesh, rays and material's textures until renderer_free(). Precomputes the radiosity texture when bouncing.
+// 0, -ENOMEM, -EINVAL (a texture without the channels it must have: logged).
 int renderer_new(struct renderer **out, const struct mesh *mesh, const struct rays *rays,
                  const struct lights *lights, const struct render_material *material,
                  const struct render_settings *settings);

@@ -6,8 +6,8 @@
 enum shape {
     SHAPE_PEBBLE, // smooth blob, convex enough not to shadow itself; 6 charts
     SHAPE_VASE,   // surface of revolution with a neck, closed; 4 charts (two half walls, foot, mouth)
-    SHAPE_KNOT,   // torus knot: concave, shadows itself; many charts
-    SHAPE_BOWL,   // thick open bowl: a concavity that interreflects; few charts
+    SHAPE_KNOT,   // torus knot: concave, shadows itself; 24 charts
+    SHAPE_BOWL,   // thick open bowl: a concavity that interreflects; 6 charts (foot, floor, outer and inner half walls)
     SHAPE_N
 };
 extern const char *const shape_names[SHAPE_N];

@@ -25,11 +25,13 @@ struct surface_point {
     float position_m[3], normal[3], tangent[3], bitangent[3];
 };
 
-// What of the lights is left for one surface point: above the horizon, visible, compacted; shared by all its views.
-// wr,wg,wb = V_i max(<n,l_i>,0) c_i(p) per channel.
+// What of the lights is left for one surface point: above the horizon, visible, compacted; shared by all its views. Directions are
+// in the surface's frame (tangent, bitangent, normal). wr,wg,wb = V_i max(<n,l_i>,0) c_i(p) per channel. Entries from n up to
+// the next multiple of KERNEL_WIDTH have weight 0. What one variant gathered another may shade.
 struct lit {
     int n, capacity;
-    float *lx, *ly, *lz, *nl, *sl /* S(nl) = (1-nl)^5 */, *wr, *wg, *wb;
+    float *lx, *ly, *nl, *sl /* S(nl) = (1-nl)^5 */, *gc /* clearcoat's g1(nl, .25) */, *wr, *wg, *wb;
+    float *lx_rest, *ly_rest; // what float left of lx, ly: sharp lobes need it
 };
 int lit_new(struct lit *out, int n_lights); // 0 or -ENOMEM
 void lit_free(struct lit *l);

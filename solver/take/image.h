@@ -3,8 +3,9 @@
 // Pixels are row-major, top row first, channels interleaved: data[(y * width + x) * n_channels + c].
 // Values are linear light unless a function says otherwise. Names are EXR channel names without layer rules of ours:
 // "R", "G", "B", "A", "clip", "roughness", ...
-// Limits: 65,536 px a side, 2^28 pixels, 64 channels, and never more memory than 1,200 x the file's size (ZIP's best ratio)
-// plus 1 MiB: a small hostile file cannot ask for gigabytes.
+// Limits: 65,536 px a side, 2^28 pixels, 64 channels, 8 GiB of file, and no more samples, counted as the file stores them, than
+// 1,200 x its size (ZIP's best ratio) plus 64 MiB (a cropped picture has a small file and a large display window): a small
+// hostile file cannot ask for gigabytes.
 #pragma once
 #include <stdbool.h>
 #include <stdint.h>
@@ -31,12 +32,14 @@ int image_read(struct image *out, const char *path);
 
 int image_channel(const struct image *image, const char *name); // index, or -1
 
-// -EDOM, logged with the first bad pixel and their count, if any value of the named channels (NULL: all) is NaN or infinite.
+// -EDOM, logged with the first bad pixel and their count, if any value of the named channels (a list that ends with NULL; names that
+// are not there are passed over; NULL itself: all channels) is NaN or infinite.
 int image_require_finite(const struct image *image, const char *const *names, const char *path);
 
 enum image_type { IMAGE_HALF, IMAGE_FLOAT };
 enum image_compression { IMAGE_ZIP, IMAGE_PIZ };
-// Atomic. Half saturates at +-65504 (never makes infinities). 0 or -errno (logged).
+// Atomic, and the same pixels always give the same bytes. Half rounds to nearest even and saturates at +-65504 (never makes
+// infinities). 0 or -errno (logged): -EDOM for a NaN, -EINVAL for two channels of one name.
 int image_write_exr(const struct image *image, const char *path, enum image_type type,
                     enum image_compression compression);
 // 8-bit PNG, n_channels 1 (grey), 3 or 4; pixels as they are (already encoded). Atomic. 0 or -errno (logged).

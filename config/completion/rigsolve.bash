@@ -1,0 +1,12 @@
+# bash completion for rigsolve: commands, then each command's own long options as its --help lists them.
+_rigsolve() {
+    local cur=${COMP_WORDS[COMP_CWORD]}
+    if [ "$COMP_CWORD" = 1 ]; then
+        mapfile -t COMPREPLY < <(compgen -W "$(rigsolve --help | sed -n 's/^  \([a-z]*\) .*/\1/p') --help --version" -- "$cur")
+    elif [[ $cur == -* ]]; then
+        mapfile -t COMPREPLY < <(compgen -W "$(rigsolve "${COMP_WORDS[1]}" --help 2>/dev/null | grep -oE -- '--[a-z-]+' | sort -u)" -- "$cur")
+    elif [ "${COMP_WORDS[1]}" = synth ] && [ "$COMP_CWORD" = 2 ]; then
+        mapfile -t COMPREPLY < <(compgen -W "D1 D2 D3 D4 D5" -- "$cur")
+    fi
+}
+complete -o default -F _rigsolve rigsolve

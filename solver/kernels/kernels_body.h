@@ -1,0 +1,529 @@
+// solver/kernels/kernels_body.h - the float kernels, written once over a vector type; each instruction set's file defines
+//   vf, LANES floats (LANES divides KERNEL_WIDTH), and vd, half as many doubles;
+//   v_set1 v_load v_store v_max v_fma(a,b,c) = ab+c, v_fnma = c-ab, v_rcp, v_rsqrt_sqrt (returns 1/sqrt, stores sqrt);
+//   v_mask: v_positive(x, bits) v_count v_compress; v_keep v_bytes add_up; d_set1 d_fma d_fnma d_wide(x, half) d_narrow(a, b)
+// and includes this file.
+//
+// Light and view directions are in the surface's own frame (x, y, n), where the horizon is a sign and alpha is diagonal.
+// With s = l + v (so h = s/|s|, lh = |s|/2) nothing needs normalising and nothing cancels:
+//   Q = P/|s|^2,  P = (sx/ax)^2 + (sy/ay)^2 + sz^2;   D = (|s|^2/P)^2 / (pi ax ay)
+//   1 + (a^2-1) nh^2 = (sx^2 + sy^2 + a^2 sz^2)/|s|^2
+// d ln(GD)/dr = const + [sx^2 dx + sy^2 dy]/P - gl/root_l [lx^2 ex + ly^2 ey], and the same by anisotropic. The isotropic G of
+// 2012 is the same expression with both of G's alphas equal, as |l| = 1; so one loop serves both variants.
+//
+// Sharp lobes: where l + v nearly cancels in x or y, float's rounding of l itself (6e-8) is not small beside alpha; the error of D
+// grows like 1e-8 / alpha^3. So directions are gathered in double and kept as float + float, and when an alpha is below SHARP both
+// parts are added; above, the first part is enough.
+//
+// 27 sums per sample carry everything (SOLVER.md 6): Fd, ss, FH, GD(1-FH), GD FH, coat, by roughness, by anisotropic, by gloss,
+// each x RGB. Sums are taken in blocks of BLOCK lights in float and added up in double, so that thousands of lights cost no digits.
+#include "solver/kernels/kernels.h"
+
+#include <math.h>
+
+enum { BLOCK = 1024 };
+#define SHARP .1f
+enum { FD, SS, FH, GDN, GDF, COAT, BY_ROUGHNESS, BY_ANISOTROPIC, BY_GLOSS, N_SUMS };
+#define INLINE static inline __attribute__((always_inline))
+
+struct constants {
+    float vx, vy, nv, sv;           // view in the surface's frame, S(nv)
+    float vx_rest, vy_rest;         // what float left of vx, vy
+    bool sharp;
+    float r4;                       // roughness / 4: F = r lh^2 = r4 |s|^2
+    float ix2, iy2, gx2, gy2;       // 1/alpha^2 of D, alpha^2 of G
+    float rx, ry, r0, gr_x, gr_y;   // d ln(GD) by roughness
+    float ax, ay, a0, ga_x, ga_y;   //           by anisotropic
+    float a2;                       // clearcoat's alpha^2
+    float gloss0, gloss1;           // d ln(Dc)/d gloss = gloss0 + gloss1 nh^2/(...)
+    float by_fd, by_ss;             // roughness derivative of the base: |s|^2 (by_fd dFd + by_ss k dFss)
+    float scale_gd, scale_coat;     // what D, G and coat have in common for all lights
+    float f0[3], kd[3];             // F0; (1-metallic) C / pi / scale_gd
+    float subsurface;
+};
+
+struct material_terms { // per call, for turning the sums into L and its derivatives
+    float tint[3], lum, sheen_colour[3], f0_dielectric[3], specular_colour[3];
+};
+
+static float dot3(const float a[3], const float b[3])
+{
+    return a[0] * b[0] + a[1] * b[1] + a[2] * b[2];
+}
+
+// <a,b> as float + float.
+static float split(const float a[3], const float b[3], float *rest)
+{
+    const double exact = (double)a[0] * (double)b[0] + (double)a[1] * (double)b[1] + (double)a[2] * (double)b[2];
+    const float first = (float)exact;
+    *rest = (float)(exact - (double)first);
+    return first;
+}
+
+static float pow5(float x)
+{
+    return x * x * (x * x) * x;
+}
+
+// False below the horizon.
+static bool find_constants(struct constants *k, struct material_terms *t, const struct surface_point *s,
+                           const float v[3], const struct shade_material *m)
+{
+    const float nv = dot3(s->normal, v);
+    if (!(nv > 0))
+        return false;
+    k->nv = nv > 1e-10f ? nv : 1e-10f; // keeps |s|^2 and 1/(nl+nv) within float's range
+    k->vx = split(s->tangent, v, &k->vx_rest), k->vy = split(s->bitangent, v, &k->vy_rest);
+    k->sv = pow5(nv < 1 ? 1 - nv : 0);
+
+    const float *theta = m->theta;
+    const float r = theta[DISNEY_ROUGHNESS], metallic = theta[DISNEY_METALLIC];
+    const float subsurface = theta[DISNEY_SUBSURFACE];
+    const float aspect2 = 1 - .9f * theta[DISNEY_ANISOTROPIC], aspect = sqrtf(aspect2);
+    const float least = .001f;
+    float ax = r * r / aspect, ax_r = 2 * r / aspect, ax_an = .45f * ax / aspect2;
+    float ay = r * r * aspect, ay_r = 2 * r * aspect, ay_an = -.45f * ay / aspect2;
+    if (ax <= least)
+        ax = least, ax_r = 0, ax_an = 0;
+    if (ay <= least)
+        ay = least, ay_r = 0, ay_an = 0;
+    k->sharp = ax < SHARP || ay < SHARP;
+    const float iax = 1 / ax, iay = 1 / ay;
+    k->ix2 = iax * iax, k->iy2 = iay * iay;
+    k->rx = 4 * k->ix2 * iax * ax_r, k->ry = 4 * k->iy2 * iay * ay_r;
+    k->ax = 4 * k->ix2 * iax * ax_an, k->ay = 4 * k->iy2 * iay * ay_an;
+    const float ag = (.5f + .5f * r) * (.5f + .5f * r);
+    if (m->variant == DISNEY_2012) {
+        k->gx2 = k->gy2 = ag * ag;
+        k->gr_x = k->gr_y = ag * (.5f + .5f * r);
+        k->ga_x = k->ga_y = 0;
+    } else {
+        k->gx2 = ax * ax, k->gy2 = ay * ay;
+        k->gr_x = ax * ax_r, k->gr_y = ay * ay_r;
+        k->ga_x = ax * ax_an, k->ga_y = ay * ay_an;
+    }
+    const float vx2 = k->vx * k->vx, vy2 = k->vy * k->vy;
+    const float root = sqrtf(vx2 * k->gx2 + vy2 * k->gy2 + k->nv * k->nv), gv = 1 / (k->nv + root);
+    k->r0 = -(iax * ax_r + iay * ay_r) - gv / root * (vx2 * k->gr_x + vy2 * k->gr_y);
+    k->a0 = -(iax * ax_an + iay * ay_an) - gv / root * (vx2 * k->ga_x + vy2 * k->ga_y);
+    k->scale_gd = gv * iax * iay * (float)M_1_PI;
+
+    const float a = .001f + .099f * (1 - theta[DISNEY_CLEARCOAT_GLOSS]), a2 = a * a, log_a2 = logf(a2);
+    const float coat_root = sqrtf(.0625f + .9375f * k->nv * k->nv);
+    k->a2 = a2;
+    k->scale_coat = .25f * (a2 - 1) / ((float)M_PI * log_a2 * (k->nv + coat_root));
+    k->gloss0 = -.099f * (2 * a / (a2 - 1) - 2 / (a * log_a2)), k->gloss1 = .198f * a;
+
+    k->r4 = .25f * r;
+    k->subsurface = subsurface;
+    k->by_fd = (1 - subsurface) * .5f, k->by_ss = subsurface * 1.25f * .25f;
+    const float lum = .3f * m->albedo[0] + .6f * m->albedo[1] + .1f * m->albedo[2];
+    t->lum = lum;
+    const float base = (1 - metallic) * (float)M_1_PI / k->scale_gd;
+    for (int c = 0; c < 3; c++) {
+        const float tint = lum > 0 ? m->albedo[c] / lum : 1;
+        t->tint[c] = tint;
+        t->sheen_colour[c] = 1 + theta[DISNEY_SHEEN_TINT] * (tint - 1);
+        t->specular_colour[c] = .08f * (1 + theta[DISNEY_SPECULAR_TINT] * (tint - 1));
+        t->f0_dielectric[c] = theta[DISNEY_SPECULAR] * t->specular_colour[c];
+        k->f0[c] = t->f0_dielectric[c] + metallic * (m->albedo[c] - t->f0_dielectric[c]);
+        k->kd[c] = base * m->albedo[c];
+    }
+    return true;
+}
+
+// Lights that cannot be gathered any more: what depends on the light only.
+struct light_vector {
+    vf lx, ly, nl, sl, gc, w[3]; // sl = S(nl); gc = clearcoat's g1(nl, .25); w = V nl c per channel
+    vf lx_rest, ly_rest;         // when sharp
+};
+
+INLINE vf v_schlick(vf u)
+{
+    const vf m = v_set1(1) - u, m2 = m * m;
+    return m2 * m2 * m;
+}
+
+INLINE vf v_coat_g(vf nl)
+{
+    vf root;
+    v_rsqrt_sqrt(v_fma(nl * v_set1(.9375f), nl, v_set1(.0625f)), &root);
+    return v_rcp(nl + root);
+}
+
+// s = l + v
+INLINE void half_vector(vf *sx, vf *sy, vf *sz, const struct constants *k, const struct light_vector *l, bool sharp)
+{
+    *sx = l->lx + v_set1(k->vx), *sy = l->ly + v_set1(k->vy), *sz = l->nl + v_set1(k->nv);
+    if (sharp)
+        *sx += l->lx_rest + v_set1(k->vx_rest), *sy += l->ly_rest + v_set1(k->vy_rest);
+}
+
+// The value alone: base[c] is what the diffuse lobe is multiplied by, sheen[c] what FH is.
+INLINE void shade_light(vf sum[3], const struct constants *k, const struct light_vector *l, bool sharp,
+                        const float base[3], const float sheen[3], bool subsurface, bool coat)
+{
+    const vf one = v_set1(1);
+    vf sx, sy, sz;
+    half_vector(&sx, &sy, &sz, k, l, sharp);
+    const vf x2 = sx * sx, y2 = sy * sy, z2 = sz * sz, xy2 = x2 + y2, s2 = xy2 + z2;
+    vf s;
+    v_rsqrt_sqrt(s2, &s);
+    const vf fh = v_schlick(s * v_set1(.5f));
+    const vf f = s2 * v_set1(k->r4), sv = v_set1(k->sv);
+    const vf e = v_fma(f, v_set1(2), v_set1(-.5f));
+    vf diffuse = v_fma(e, l->sl, one) * v_fma(e, sv, one);
+    if (subsurface) {
+        const vf u = f - one;
+        const vf fss = v_fma(u, l->sl, one) * v_fma(u, sv, one);
+        const vf ss = v_fma(fss * v_set1(1.25f), v_rcp(sz) - v_set1(.5f), v_set1(.625f));
+        diffuse = v_fma(v_set1(k->subsurface), ss - diffuse, diffuse);
+    }
+    const vf d = s2 * v_rcp(v_fma(x2, v_set1(k->ix2), v_fma(y2, v_set1(k->iy2), z2)));
+    const vf root2 = v_fma(l->nl, l->nl, v_fma(l->lx * v_set1(k->gx2), l->lx, l->ly * v_set1(k->gy2) * l->ly));
+    vf root;
+    v_rsqrt_sqrt(root2, &root);
+    const vf gd = d * d * v_rcp(l->nl + root) * v_set1(k->scale_gd);
+    vf gdf = gd * fh;
+    const vf gdn = gd - gdf;
+    if (coat) {
+        const vf dc = s2 * v_rcp(v_fma(z2, v_set1(k->a2), xy2));
+        gdf = v_fma(l->gc * dc, v_fma(fh, v_set1(.96f * k->scale_coat), v_set1(.04f * k->scale_coat)), gdf);
+    }
+    for (int c = 0; c < 3; c++) {
+        const vf value = v_fma(diffuse, v_set1(base[c]),
+                               v_fma(fh, v_set1(sheen[c]), v_fma(gdn, v_set1(k->f0[c]), gdf)));
+        sum[c] = v_fma(l->w[c], value, sum[c]);
+    }
+}
+
+INLINE void jacobian_light(vf sum[N_SUMS][3], const struct constants *k, const struct light_vector *l, bool sharp)
+{
+    const vf one = v_set1(1);
+    vf sx, sy, sz;
+    half_vector(&sx, &sy, &sz, k, l, sharp);
+    const vf x2 = sx * sx, y2 = sy * sy, z2 = sz * sz, xy2 = x2 + y2, s2 = xy2 + z2;
+    vf s;
+    v_rsqrt_sqrt(s2, &s);
+    vf term[N_SUMS];
+    term[FH] = v_schlick(s * v_set1(.5f));
+
+    // Fd = A B with F90-1 = 2 r lh^2 - 1/2; ss = 1.25 [A' B' (1/(nl+nv) - 1/2) + 1/2] with F90-1 = r lh^2 - 1.
+    const vf f = s2 * v_set1(k->r4), sv = v_set1(k->sv);
+    const vf e = v_fma(f, v_set1(2), v_set1(-.5f)), u = f - one;
+    const vf a = v_fma(e, l->sl, one), b = v_fma(e, sv, one);
+    const vf a_ss = v_fma(u, l->sl, one), b_ss = v_fma(u, sv, one);
+    const vf k_ss = v_rcp(sz) - v_set1(.5f);
+    term[FD] = a * b;
+    term[SS] = v_fma(a_ss * b_ss * v_set1(1.25f), k_ss, v_set1(.625f));
+    const vf d_fd = v_fma(l->sl, b, sv * a), d_ss = v_fma(l->sl, b_ss, sv * a_ss);
+    const vf base_r = s2 * v_fma(d_fd, v_set1(k->by_fd), d_ss * k_ss * v_set1(k->by_ss));
+
+    const vf ip = v_rcp(v_fma(x2, v_set1(k->ix2), v_fma(y2, v_set1(k->iy2), z2))), d = s2 * ip;
+    const vf lx2 = l->lx * l->lx, ly2 = l->ly * l->ly;
+    vf root;
+    const vf iroot = v_rsqrt_sqrt(v_fma(l->nl, l->nl, v_fma(lx2, v_set1(k->gx2), ly2 * v_set1(k->gy2))), &root);
+    const vf g = v_rcp(l->nl + root), gi = g * iroot;
+    const vf gd = d * d * g;
+    const vf gr = v_fma(lx2, v_set1(k->gr_x), ly2 * v_set1(k->gr_y));
+    const vf ga = v_fma(lx2, v_set1(k->ga_x), ly2 * v_set1(k->ga_y));
+    const vf dr = v_fma(x2, v_set1(k->rx), y2 * v_set1(k->ry)), da = v_fma(x2, v_set1(k->ax), y2 * v_set1(k->ay));
+    const vf gd_r = gd * v_fnma(gi, gr, v_fma(ip, dr, v_set1(k->r0)));
+    const vf gd_a = gd * v_fnma(gi, ga, v_fma(ip, da, v_set1(k->a0)));
+    term[GDF] = gd * term[FH];
+    term[GDN] = gd - term[GDF];
+
+    const vf ic = v_rcp(v_fma(z2, v_set1(k->a2), xy2));
+    term[COAT] = l->gc * s2 * ic * v_fma(term[FH], v_set1(.96f), v_set1(.04f));
+    term[BY_GLOSS] = term[COAT] * v_fma(z2 * ic, v_set1(k->gloss1), v_set1(k->gloss0));
+
+    const vf not_fh = one - term[FH];
+    for (int c = 0; c < 3; c++) {
+        const vf fresnel = v_fma(v_set1(k->f0[c]), not_fh, term[FH]);
+        const vf by_r = v_fma(gd_r, fresnel, base_r * v_set1(k->kd[c])), by_a = gd_a * fresnel;
+        for (int i = 0; i < N_SUMS; i++)
+            sum[i][c] = v_fma(l->w[c], i == BY_ROUGHNESS ? by_r : i == BY_ANISOTROPIC ? by_a : term[i], sum[i][c]);
+    }
+}
+
+static void finish(struct shade_jacobian *out, double sums[N_SUMS][3], const struct constants *k,
+                   const struct material_terms *t, const struct shade_material *m)
+{
+    const float *theta = m->theta, weight[3] = { .3f, .6f, .1f };
+    const float metallic = theta[DISNEY_METALLIC], dielectric = 1 - metallic;
+    const float specular = theta[DISNEY_SPECULAR], specular_tint = theta[DISNEY_SPECULAR_TINT];
+    const float sheen = theta[DISNEY_SHEEN], sheen_tint = theta[DISNEY_SHEEN_TINT];
+    const float clearcoat = theta[DISNEY_CLEARCOAT], ilum = t->lum > 0 ? 1 / t->lum : 0;
+    for (int c = 0; c < 3; c++) {
+        const float fd = (float)sums[FD][c] * (float)M_1_PI, ss = (float)sums[SS][c] * (float)M_1_PI;
+        const float fh = (float)sums[FH][c];
+        const float gdn = k->scale_gd * (float)sums[GDN][c], gdf = k->scale_gd * (float)sums[GDF][c];
+        const float coat = k->scale_coat * (float)sums[COAT][c], gloss = k->scale_coat * (float)sums[BY_GLOSS][c];
+        const float base = fd + theta[DISNEY_SUBSURFACE] * (ss - fd), albedo = m->albedo[c], tint = t->tint[c];
+        const float diffuse = albedo * base + fh * sheen * t->sheen_colour[c];
+        out->L[c] = dielectric * diffuse + k->f0[c] * gdn + gdf + clearcoat * coat;
+        float *d = out->theta[c];
+        d[DISNEY_METALLIC] = gdn * (albedo - t->f0_dielectric[c]) - diffuse;
+        d[DISNEY_SUBSURFACE] = dielectric * albedo * (ss - fd);
+        d[DISNEY_SPECULAR] = dielectric * gdn * t->specular_colour[c];
+        d[DISNEY_ROUGHNESS] = k->scale_gd * (float)sums[BY_ROUGHNESS][c];
+        d[DISNEY_SPECULAR_TINT] = dielectric * gdn * .08f * specular * (tint - 1);
+        d[DISNEY_ANISOTROPIC] = k->scale_gd * (float)sums[BY_ANISOTROPIC][c];
+        d[DISNEY_SHEEN] = dielectric * fh * t->sheen_colour[c];
+        d[DISNEY_SHEEN_TINT] = dielectric * fh * sheen * (tint - 1);
+        d[DISNEY_CLEARCOAT] = coat;
+        d[DISNEY_CLEARCOAT_GLOSS] = clearcoat * gloss;
+        const float by_tint = dielectric * (fh * sheen * sheen_tint + gdn * .08f * specular * specular_tint) * ilum;
+        const float by_self = dielectric * base + metallic * gdn;
+        for (int j = 0; j < 3; j++)
+            out->albedo[c][j] = by_tint * ((c == j) - tint * weight[j]) + (c == j ? by_self : 0);
+    }
+}
+
+INLINE void clear_sums(vf sum[N_SUMS][3])
+{
+    for (int i = 0; i < N_SUMS; i++)
+        sum[i][0] = sum[i][1] = sum[i][2] = v_set1(0);
+}
+
+INLINE void load_lit(struct light_vector *l, const struct lit *lit, int i, bool sharp)
+{
+    l->lx = v_load(lit->lx + i), l->ly = v_load(lit->ly + i), l->nl = v_load(lit->nl + i);
+    l->sl = v_load(lit->sl + i), l->gc = v_load(lit->gc + i);
+    l->w[0] = v_load(lit->wr + i), l->w[1] = v_load(lit->wg + i), l->w[2] = v_load(lit->wb + i);
+    if (sharp)
+        l->lx_rest = v_load(lit->lx_rest + i), l->ly_rest = v_load(lit->ly_rest + i);
+}
+
+INLINE void jacobian_all(double sums[N_SUMS][3], const struct lit *lit, const struct constants *k, bool sharp)
+{
+    for (int begin = 0; begin < lit->n; begin += BLOCK) {
+        const int end = lit->n - begin < BLOCK ? lit->n : begin + BLOCK;
+        vf sum[N_SUMS][3];
+        clear_sums(sum);
+        for (int i = begin; i < end; i += LANES) {
+            struct light_vector l;
+            load_lit(&l, lit, i, sharp);
+            jacobian_light(sum, k, &l, sharp);
+        }
+        add_up(&sum[0][0], N_SUMS * 3, &sums[0][0]);
+    }
+}
+
+static void shade_jacobian(struct shade_jacobian *out, const struct lit *lit, const struct surface_point *s,
+                           const float v[3], const struct shade_material *m)
+{
+    struct constants k;
+    struct material_terms t;
+    *out = (struct shade_jacobian){ 0 };
+    if (!find_constants(&k, &t, s, v, m))
+        return;
+    double sums[N_SUMS][3] = { 0 };
+    if (k.sharp)
+        jacobian_all(sums, lit, &k, true);
+    else
+        jacobian_all(sums, lit, &k, false);
+    finish(out, sums, &k, &t, m);
+}
+
+INLINE void shade_all(double L[3], const struct lit *lit, const struct constants *k, bool sharp, const float base[3],
+                      const float sheen[3], bool subsurface, bool coat)
+{
+    for (int begin = 0; begin < lit->n; begin += BLOCK) {
+        const int end = lit->n - begin < BLOCK ? lit->n : begin + BLOCK;
+        vf sum[3] = { v_set1(0), v_set1(0), v_set1(0) };
+        for (int i = begin; i < end; i += LANES) {
+            struct light_vector l;
+            load_lit(&l, lit, i, sharp);
+            shade_light(sum, k, &l, sharp, base, sheen, subsurface, coat);
+        }
+        add_up(sum, 3, L);
+    }
+}
+
+static void shade(float L[3], const struct lit *lit, const struct surface_point *s, const float v[3],
+                  const struct shade_material *m)
+{
+    struct constants k;
+    struct material_terms t;
+    L[0] = L[1] = L[2] = 0;
+    if (!find_constants(&k, &t, s, v, m))
+        return;
+    const float dielectric = 1 - m->theta[DISNEY_METALLIC];
+    float base[3], sheen[3];
+    for (int c = 0; c < 3; c++) {
+        base[c] = dielectric * m->albedo[c] * (float)M_1_PI;
+        sheen[c] = dielectric * m->theta[DISNEY_SHEEN] * t.sheen_colour[c];
+    }
+    k.scale_coat *= m->theta[DISNEY_CLEARCOAT];
+    const bool subsurface = m->theta[DISNEY_SUBSURFACE] > 0 && dielectric > 0, coat = m->theta[DISNEY_CLEARCOAT] > 0;
+    double sums[3] = { 0 };
+    if (k.sharp)
+        shade_all(sums, lit, &k, true, base, sheen, true, true);
+    else if (subsurface && coat)
+        shade_all(sums, lit, &k, false, base, sheen, true, true);
+    else if (subsurface)
+        shade_all(sums, lit, &k, false, base, sheen, true, false);
+    else if (coat)
+        shade_all(sums, lit, &k, false, base, sheen, false, true);
+    else
+        shade_all(sums, lit, &k, false, base, sheen, false, false);
+    for (int c = 0; c < 3; c++)
+        L[c] = (float)sums[c];
+}
+
+// Eqs. 1-4 for LANES lights: direction in the surface's frame and nl max(<u,d>,0)/|u|^3, with u = d + q (centre - p).
+struct incoming {
+    vf lx, ly, nl, weight, lx_rest, ly_rest;
+};
+
+// nl stays above 0 so that nothing divides by 0, whatever the weight.
+INLINE void weigh(struct incoming *in, vf ud, vf iu)
+{
+    in->weight = v_max(in->nl, v_set1(0)) * v_max(ud, v_set1(0)) * (iu * iu * iu);
+    in->nl = v_max(in->nl, v_set1(1e-10f));
+}
+
+INLINE struct incoming light_at(const struct light_arrays *a, int i, const struct surface_point *s)
+{
+    const vf q = v_load(a->q + i);
+    vf d[3], u[3];
+    for (int c = 0; c < 3; c++) {
+        d[c] = v_load((c == 0 ? a->dx : c == 1 ? a->dy : a->dz) + i);
+        u[c] = v_fma(q, v_set1(a->centre_m[c] - s->position_m[c]), d[c]);
+    }
+    vf unused;
+    const vf iu = v_rsqrt_sqrt(v_max(v_fma(u[0], u[0], v_fma(u[1], u[1], u[2] * u[2])), v_set1(1e-12f)), &unused);
+    const float *const x = s->tangent, *const y = s->bitangent, *const n = s->normal;
+    struct incoming in;
+    in.lx = iu * v_fma(u[0], v_set1(x[0]), v_fma(u[1], v_set1(x[1]), u[2] * v_set1(x[2])));
+    in.ly = iu * v_fma(u[0], v_set1(y[0]), v_fma(u[1], v_set1(y[1]), u[2] * v_set1(y[2])));
+    in.nl = iu * v_fma(u[0], v_set1(n[0]), v_fma(u[1], v_set1(n[1]), u[2] * v_set1(n[2])));
+    weigh(&in, v_fma(u[0], d[0], v_fma(u[1], d[1], u[2] * d[2])), iu);
+    return in;
+}
+
+// The same in double, half a vector at a time.
+INLINE struct incoming light_at_exact(const struct light_arrays *a, int i, const struct surface_point *s)
+{
+    vd lx[2], ly[2], nl[2], ud[2], iu[2];
+    for (int half = 0; half < 2; half++) {
+        const vd q = d_wide(v_load(a->q + i), half);
+        vd d[3], u[3];
+        for (int c = 0; c < 3; c++) {
+            d[c] = d_wide(v_load((c == 0 ? a->dx : c == 1 ? a->dy : a->dz) + i), half);
+            u[c] = d_fma(q, d_set1((double)a->centre_m[c] - (double)s->position_m[c]), d[c]);
+        }
+        const vd u2 = d_fma(u[0], u[0], d_fma(u[1], u[1], u[2] * u[2]));
+        ud[half] = d_fma(u[0], d[0], d_fma(u[1], d[1], u[2] * d[2]));
+        iu[half] = u2;
+        const float *const x = s->tangent, *const y = s->bitangent, *const n = s->normal;
+        lx[half] = d_fma(u[0], d_set1((double)x[0]), d_fma(u[1], d_set1((double)x[1]), u[2] * d_set1((double)x[2])));
+        ly[half] = d_fma(u[0], d_set1((double)y[0]), d_fma(u[1], d_set1((double)y[1]), u[2] * d_set1((double)y[2])));
+        nl[half] = d_fma(u[0], d_set1((double)n[0]), d_fma(u[1], d_set1((double)n[1]), u[2] * d_set1((double)n[2])));
+    }
+    vf unused;
+    const vf start = v_rsqrt_sqrt(v_max(d_narrow(iu[0], iu[1]), v_set1(1e-12f)), &unused);
+    for (int half = 0; half < 2; half++) { // one Newton step takes 1e-7 to 1e-14
+        const vd y = d_wide(start, half), e = d_fnma(iu[half] * y, y, d_set1(1));
+        iu[half] = d_fma(y * d_set1(.5), e, y);
+        lx[half] *= iu[half], ly[half] *= iu[half], nl[half] *= iu[half];
+    }
+    struct incoming in = { .lx = d_narrow(lx[0], lx[1]), .ly = d_narrow(ly[0], ly[1]), .nl = d_narrow(nl[0], nl[1]) };
+    in.lx_rest = d_narrow(lx[0] - d_wide(in.lx, 0), lx[1] - d_wide(in.lx, 1));
+    in.ly_rest = d_narrow(ly[0] - d_wide(in.ly, 0), ly[1] - d_wide(in.ly, 1));
+    weigh(&in, d_narrow(ud[0], ud[1]), d_narrow(iu[0], iu[1]));
+    return in;
+}
+
+static unsigned visible_bits(const uint16_t *visible, int i)
+{
+    return visible ? (unsigned)visible[i / 16] >> i % 16 : ~0u;
+}
+
+static void gather(struct lit *out, const struct light_arrays *a, const struct surface_point *s,
+                   const uint16_t *visible, const uint8_t *soft)
+{
+    int n = 0;
+    for (int i = 0; i < a->n_padded; i += LANES) {
+        struct incoming in = light_at_exact(a, i, s);
+        if (soft)
+            in.weight = in.weight * v_bytes(soft + i, a->n - i) * v_set1(1 / 255.f);
+        // weight > 0 holds for lights above the horizon that face the point, and for no padding.
+        const v_mask keep = v_positive(in.weight, visible_bits(visible, i));
+        v_compress(out->lx + n, in.lx, keep), v_compress(out->ly + n, in.ly, keep);
+        v_compress(out->lx_rest + n, in.lx_rest, keep), v_compress(out->ly_rest + n, in.ly_rest, keep);
+        v_compress(out->nl + n, in.nl, keep);
+        v_compress(out->wr + n, in.weight * v_load(a->cr + i), keep);
+        v_compress(out->wg + n, in.weight * v_load(a->cg + i), keep);
+        v_compress(out->wb + n, in.weight * v_load(a->cb + i), keep);
+        n += v_count(keep);
+    }
+    out->n = n;
+    for (int i = n; i % KERNEL_WIDTH; i++) {
+        out->lx[i] = out->ly[i] = out->lx_rest[i] = out->ly_rest[i] = 0;
+        out->wr[i] = out->wg[i] = out->wb[i] = 0;
+        out->nl[i] = 1;
+    }
+    for (int i = 0; i < n; i += LANES) {
+        const vf nl = v_load(out->nl + i);
+        v_store(out->sl + i, v_schlick(nl));
+        v_store(out->gc + i, v_coat_g(nl));
+    }
+}
+
+INLINE void brute_all(double sums[N_SUMS][3], const struct light_arrays *a, const struct surface_point *s,
+                      const struct constants *k, bool sharp)
+{
+    for (int begin = 0; begin < a->n_padded; begin += BLOCK) {
+        const int end = a->n_padded - begin < BLOCK ? a->n_padded : begin + BLOCK;
+        vf sum[N_SUMS][3];
+        clear_sums(sum);
+        for (int i = begin; i < end; i += LANES) {
+            const struct incoming in = sharp ? light_at_exact(a, i, s) : light_at(a, i, s);
+            struct light_vector l = { .lx = in.lx, .ly = in.ly, .nl = in.nl };
+            if (sharp)
+                l.lx_rest = in.lx_rest, l.ly_rest = in.ly_rest;
+            l.sl = v_schlick(l.nl), l.gc = v_coat_g(l.nl);
+            l.w[0] = in.weight * v_load(a->cr + i), l.w[1] = in.weight * v_load(a->cg + i);
+            l.w[2] = in.weight * v_load(a->cb + i);
+            jacobian_light(sum, k, &l, sharp);
+        }
+        add_up(&sum[0][0], N_SUMS * 3, &sums[0][0]);
+    }
+}
+
+static void brute_jacobian(struct shade_jacobian *out, const struct light_arrays *a, const struct surface_point *s,
+                           const float v[3], const struct shade_material *m)
+{
+    struct constants k;
+    struct material_terms t;
+    *out = (struct shade_jacobian){ 0 };
+    if (!find_constants(&k, &t, s, v, m))
+        return;
+    double sums[N_SUMS][3] = { 0 };
+    if (k.sharp)
+        brute_all(sums, a, s, &k, true);
+    else
+        brute_all(sums, a, s, &k, false);
+    finish(out, sums, &k, &t, m);
+}
+
+static void irradiance(float E[3], const struct light_arrays *a, const struct surface_point *s,
+                       const uint16_t *visible)
+{
+    double sums[3] = { 0 };
+    for (int begin = 0; begin < a->n_padded; begin += BLOCK) {
+        const int end = a->n_padded - begin < BLOCK ? a->n_padded : begin + BLOCK;
+        vf sum[3] = { v_set1(0), v_set1(0), v_set1(0) };
+        for (int i = begin; i < end; i += LANES) {
+            const vf w = v_keep(light_at(a, i, s).weight, visible_bits(visible, i));
+            sum[0] = v_fma(w, v_load(a->cr + i), sum[0]);
+            sum[1] = v_fma(w, v_load(a->cg + i), sum[1]);
+            sum[2] = v_fma(w, v_load(a->cb + i), sum[2]);
+        }
+        add_up(sum, 3, sums);
+    }
+    for (int c = 0; c < 3; c++)
+        E[c] = (float)sums[c];
+}

@@ -1,0 +1,194 @@
+// solver/kernels/kernels_ref.c - Eqs. 1-5 as they stand, in double and through disney.c; slow, and the yardstick.
+#include "solver/kernels/kernels_table.h"
+#include "solver/vec3.h"
+
+// Eqs. 1-4 for light i: unit direction and max(<u,d>,0)/|u|^3 with u = d + q (centre - p). False: nothing arrives.
+static bool light_at(const struct light_arrays *a, int i, const struct surface_point *s, double l[3], double *weight)
+{
+    const double d[3] = { (double)a->dx[i], (double)a->dy[i], (double)a->dz[i] };
+    for (int c = 0; c < 3; c++)
+        l[c] = d[c] + (double)a->q[i] * ((double)a->centre_m[c] - (double)s->position_m[c]);
+    const double facing = vec3_dot(l, d), length = vec3_normalise(l);
+    if (!(facing > 0))
+        return false;
+    *weight = facing / (length * length * length);
+    return true;
+}
+
+static double visibility(const uint16_t *visible, const uint8_t *soft, int i)
+{
+    if (visible && !(visible[i / 16] >> i % 16 & 1))
+        return 0;
+    return soft ? soft[i] / 255. : 1;
+}
+
+static void to_double(double out[3], const float in[3])
+{
+    for (int c = 0; c < 3; c++)
+        out[c] = (double)in[c];
+}
+
+static struct disney_frame frame_of(const struct surface_point *s)
+{
+    struct disney_frame frame;
+    to_double(frame.n, s->normal), to_double(frame.x, s->tangent), to_double(frame.y, s->bitangent);
+    return frame;
+}
+
+static struct disney material_of(const struct shade_material *m)
+{
+    struct disney out = { .variant = m->variant };
+    for (int i = 0; i < DISNEY_N; i++)
+        out.theta[i] = (double)m->theta[i];
+    to_double(out.albedo, m->albedo);
+    return out;
+}
+
+static void gather(struct lit *out, const struct light_arrays *a, const struct surface_point *s,
+                   const uint16_t *visible, const uint8_t *soft)
+{
+    const struct disney_frame frame = frame_of(s);
+    int n = 0;
+    for (int i = 0; i < a->n; i++) {
+        double l[3], w;
+        if (!light_at(a, i, s, l, &w))
+            continue;
+        const double nl = vec3_dot(frame.n, l);
+        w *= nl * visibility(visible, soft, i);
+        if (!(w > 0))
+            continue;
+        const double lx = vec3_dot(frame.x, l), ly = vec3_dot(frame.y, l);
+        out->lx[n] = (float)lx, out->lx_rest[n] = (float)(lx - (double)out->lx[n]);
+        out->ly[n] = (float)ly, out->ly_rest[n] = (float)(ly - (double)out->ly[n]);
+        out->nl[n] = (float)nl;
+        out->sl[n] = (float)pow(nl < 1 ? 1 - nl : 0, 5);
+        out->gc[n] = (float)(1 / (nl + sqrt(.0625 + .9375 * nl * nl)));
+        out->wr[n] = (float)(w * (double)a->cr[i]);
+        out->wg[n] = (float)(w * (double)a->cg[i]);
+        out->wb[n] = (float)(w * (double)a->cb[i]);
+        n++;
+    }
+    out->n = n;
+    for (; n % KERNEL_WIDTH; n++) {
+        out->lx[n] = out->ly[n] = out->lx_rest[n] = out->ly_rest[n] = out->sl[n] = out->wr[n] = out->wg[n] = out->wb[n] = 0;
+        out->nl[n] = out->gc[n] = 1;
+    }
+}
+
+static const struct disney_frame own_frame = { .n = { 0, 0, 1 }, .x = { 1, 0, 0 }, .y = { 0, 1, 0 } };
+
+static void to_own_frame(double out[3], const struct surface_point *s, const float v[3])
+{
+    const struct disney_frame frame = frame_of(s);
+    double d[3];
+    to_double(d, v);
+    out[0] = vec3_dot(frame.x, d), out[1] = vec3_dot(frame.y, d), out[2] = vec3_dot(frame.n, d);
+}
+
+static void lit_direction(double l[3], const struct lit *lit, int i)
+{
+    l[0] = (double)lit->lx[i] + (double)lit->lx_rest[i];
+    l[1] = (double)lit->ly[i] + (double)lit->ly_rest[i];
+    l[2] = (double)lit->nl[i];
+}
+
+static void shade(float L[3], const struct lit *lit, const struct surface_point *s, const float v[3],
+                  const struct shade_material *m)
+{
+    const struct disney material = material_of(m);
+    double view[3], sum[3] = { 0 };
+    to_own_frame(view, s, v);
+    for (int i = 0; i < lit->n; i++) {
+        double l[3];
+        lit_direction(l, lit, i);
+        double f[3];
+        disney_eval(&material, &own_frame, l, view, f);
+        sum[0] += f[0] * (double)lit->wr[i], sum[1] += f[1] * (double)lit->wg[i], sum[2] += f[2] * (double)lit->wb[i];
+    }
+    for (int c = 0; c < 3; c++)
+        L[c] = (float)sum[c];
+}
+
+struct sums {
+    double L[3], theta[3][DISNEY_N], albedo[3][3];
+};
+
+static void add_light(struct sums *sum, const struct disney *material, const struct disney_frame *frame,
+                      const double l[3], const double v[3], const double w[3])
+{
+    struct disney_gradient g;
+    disney_eval_gradient(material, frame, l, v, &g);
+    for (int c = 0; c < 3; c++) {
+        sum->L[c] += g.f[c] * w[c];
+        for (int i = 0; i < DISNEY_N; i++)
+            sum->theta[c][i] += g.theta[c][i] * w[c];
+        for (int i = 0; i < 3; i++)
+            sum->albedo[c][i] += g.albedo[c][i] * w[c];
+    }
+}
+
+static void round_sums(struct shade_jacobian *out, const struct sums *sum)
+{
+    for (int c = 0; c < 3; c++) {
+        out->L[c] = (float)sum->L[c];
+        for (int i = 0; i < DISNEY_N; i++)
+            out->theta[c][i] = (float)sum->theta[c][i];
+        for (int i = 0; i < 3; i++)
+            out->albedo[c][i] = (float)sum->albedo[c][i];
+    }
+}
+
+static void shade_jacobian(struct shade_jacobian *out, const struct lit *lit, const struct surface_point *s,
+                           const float v[3], const struct shade_material *m)
+{
+    const struct disney material = material_of(m);
+    double view[3];
+    struct sums sum = { 0 };
+    to_own_frame(view, s, v);
+    for (int i = 0; i < lit->n; i++) {
+        double l[3];
+        lit_direction(l, lit, i);
+        const double w[3] = { (double)lit->wr[i], (double)lit->wg[i], (double)lit->wb[i] };
+        add_light(&sum, &material, &own_frame, l, view, w);
+    }
+    round_sums(out, &sum);
+}
+
+static void brute_jacobian(struct shade_jacobian *out, const struct light_arrays *a, const struct surface_point *s,
+                           const float v[3], const struct shade_material *m)
+{
+    const struct disney material = material_of(m);
+    const struct disney_frame frame = frame_of(s);
+    double view[3];
+    struct sums sum = { 0 };
+    to_double(view, v);
+    for (int i = 0; i < a->n; i++) {
+        double l[3], w;
+        if (!light_at(a, i, s, l, &w))
+            continue;
+        w *= fmax(vec3_dot(frame.n, l), 0);
+        const double weights[3] = { w * (double)a->cr[i], w * (double)a->cg[i], w * (double)a->cb[i] };
+        add_light(&sum, &material, &frame, l, view, weights);
+    }
+    round_sums(out, &sum);
+}
+
+static void irradiance(float E[3], const struct light_arrays *a, const struct surface_point *s,
+                       const uint16_t *visible)
+{
+    const struct disney_frame frame = frame_of(s);
+    double sum[3] = { 0 };
+    for (int i = 0; i < a->n; i++) {
+        double l[3], w;
+        if (!light_at(a, i, s, l, &w))
+            continue;
+        w *= fmax(vec3_dot(frame.n, l), 0) * visibility(visible, 0, i);
+        sum[0] += w * (double)a->cr[i], sum[1] += w * (double)a->cg[i], sum[2] += w * (double)a->cb[i];
+    }
+    for (int c = 0; c < 3; c++)
+        E[c] = (float)sum[c];
+}
+
+const struct kernels kernels_reference_table = {
+    "reference", gather, shade, shade_jacobian, brute_jacobian, irradiance,
+};

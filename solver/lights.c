@@ -1,0 +1,600 @@
+// solver/lights.c - cutting a panorama into lights, their irradiance at a point with derivatives,
+// and lights.json.
+//
+// Letters (paper, Eqs. 1-4): dh probe direction, C irradiance, c centre, R world_from_probe, q =
+// 1/r.
+#include "solver/lights.h"
+#include "solver/take/log.h"
+#include "solver/vec3.h"
+
+#include <assert.h>
+#include <errno.h>
+#include <stdbool.h>
+#include <stdio.h>
+#include <stdlib.h>
+#include <string.h>
+
+// ---- memory
+// -------------------------------------------------------------------------------------------------------------
+
+int lights_new(struct lights *out, int n)
+{
+    assert(n >= 1);
+    struct lights l = {
+        .n = n,
+        .dir_probe = calloc((size_t)n, sizeof(*l.dir_probe)),
+        .irradiance = calloc((size_t)n, sizeof(*l.irradiance)),
+        .inverse_distance = calloc((size_t)n, sizeof(*l.inverse_distance)),
+        .group = malloc((size_t)n * sizeof(*l.group)),
+        .world_from_probe = {1, 0, 0, 0, 1, 0, 0, 0, 1},
+    };
+    memset(out, 0, sizeof(*out));
+    if (!l.dir_probe || !l.irradiance || !l.inverse_distance || !l.group) {
+        lights_free(&l);
+        return -ENOMEM;
+    }
+    for (int i = 0; i < n; i++)
+        l.group[i] = -1;
+    *out = l;
+    return 0;
+}
+
+void lights_free(struct lights *l)
+{
+    if (!l)
+        return;
+    free(l->dir_probe);
+    free(l->irradiance);
+    free(l->region);
+    free(l->spread_rad);
+    free(l->inverse_distance);
+    free(l->group);
+    memset(l, 0, sizeof(*l));
+}
+
+// ---- one light at one point (Eqs. 1-4)
+// ----------------------------------------------------------------------------------
+//
+//   a = R dh,  u = a + q (c - p),  s = |u|,  l = u / s,  weight = max(<u, a>, 0) / s^3
+//
+// With r = 1/q this is l = (l_p - p)/|l_p - p| and weight = r^2/|l_p - p|^2 max(<l, l_d>, 0), for
+// l_p - p = r u. A light emits into the half space in front of it: behind it the weight is 0. The
+// point at the light itself (s below rounding) has no direction; it gets l = a and weight 0.
+
+static const double s_min = 1e-12;
+
+// Returns false where the weight, and with it every derivative, is 0.
+static bool light_vector(const struct lights *l, int i, const double p[3], double a[3], double u[3],
+                         double *s, struct light_at *at)
+{
+    const double q = l->inverse_distance[i];
+    mat3_mul_vec(a, l->world_from_probe, l->dir_probe[i]);
+    for (int k = 0; k < 3; k++)
+        u[k] = a[k] + q * (l->centre_m[k] - p[k]);
+    *s = vec3_norm(u);
+    const double facing = vec3_dot(u, a);
+    at->weight = 0;
+    if (!(*s > s_min)) {
+        memcpy(at->l, a, sizeof(at->l));
+        return false;
+    }
+    for (int k = 0; k < 3; k++)
+        at->l[k] = u[k] / *s;
+    if (!(facing > 0))
+        return false;
+    at->weight = facing / (*s * *s * *s);
+    return true;
+}
+
+void light_at_point(const struct lights *l, int i, const double point_m[3], struct light_at *out)
+{
+    double a[3], u[3], s;
+    light_vector(l, i, point_m, a, u, &s, out);
+}
+
+// By the chain rule over u and a, with m = <u, a>:
+//   dl/du = (I - l l^T)/s,  dweight/du = a/s^3 - 3 m u/s^5,  dweight/da = u/s^3
+//   du/dc = q I,  du/dp = -q I,  du/dq = c - p,  da/dw = du/dw = -[a]x  (R = exp([w]x) R0, so a
+//   moves by w x a)
+void light_at_point_gradient(const struct lights *l, int i, const double point_m[3],
+                             struct light_at_gradient *out)
+{
+    double a[3], u[3], s;
+    memset(out, 0, sizeof(*out));
+    if (!light_vector(l, i, point_m, a, u, &s, &out->at))
+        return;
+    const double q = l->inverse_distance[i], s3 = s * s * s, m = vec3_dot(u, a);
+    const double minus_a_cross[9] = {0, a[2], -a[1], -a[2], 0, a[0], a[1], -a[0], 0};
+    double l_u[9], weight_u[3], weight_ua[3], c_minus_p[3];
+    vec3_sub(c_minus_p, l->centre_m, point_m);
+    for (int j = 0; j < 3; j++) {
+        weight_u[j] = a[j] / s3 - 3 * m * u[j] / (s3 * s * s);
+        weight_ua[j] = weight_u[j] + u[j] / s3;
+        for (int k = 0; k < 3; k++)
+            l_u[3 * j + k] = ((j == k) - out->at.l[j] * out->at.l[k]) / s;
+    }
+    for (int j = 0; j < 9; j++) {
+        out->l_centre[j] = q * l_u[j];
+        out->l_point[j] = -q * l_u[j];
+    }
+    for (int j = 0; j < 3; j++) {
+        out->weight_centre[j] = q * weight_u[j];
+        out->weight_point[j] = -q * weight_u[j];
+    }
+    mat3_mul(out->l_rotation, l_u, minus_a_cross);
+    mat3_tmul_vec(out->weight_rotation, minus_a_cross, weight_ua);
+    mat3_mul_vec(out->l_inverse_distance, l_u, c_minus_p);
+    out->weight_inverse_distance = vec3_dot(weight_u, c_minus_p);
+}
+
+// ---- median cut
+// ---------------------------------------------------------------------------------------------------------
+
+struct cutter {
+    const struct panorama *p;
+    int width, height;
+    double *sin_lon, *cos_lon;         // [width] of pixel centres
+    double *sin_lat, *cos_lat, *omega; // [height]; omega: solid angle of the row's pixels
+    double *along; // [max(width, height)] energy of each column or row of one region
+    struct lights *out;
+};
+
+// What the cut halves: luminance by Rec. 709.
+static double luminance(const float *rgb)
+{
+    return .2126 * rgb[0] + .7152 * rgb[1] + .0722 * rgb[2];
+}
+
+static const float *pixel_at(const struct cutter *k, int x, int y)
+{
+    return k->p->image.data + 3 * ((int64_t)y * k->width + x);
+}
+
+// Energy per column (by_columns) or row of the region into k->along. Summed from the pixels
+// themselves, so that a region of no energy is exactly 0; differences of one table over the whole
+// panorama would leave its rounding there.
+static double sum_along(const struct cutter *k, const struct light_region *r, bool by_columns)
+{
+    double total = 0;
+    memset(k->along, 0, (size_t)(by_columns ? r->x1 - r->x0 : r->y1 - r->y0) * sizeof(double));
+    for (int y = r->y0; y < r->y1; y++) {
+        double row = 0;
+        for (int x = r->x0; x < r->x1; x++) {
+            const double energy = luminance(pixel_at(k, x, y)) * k->omega[y];
+            row += energy;
+            if (by_columns)
+                k->along[x - r->x0] += energy;
+        }
+        if (!by_columns)
+            k->along[y - r->y0] = row;
+        total += row;
+    }
+    return total;
+}
+
+// Where energies along[0..n) are best halved: in [1, n-1]. Of equally good places the one nearest
+// the middle, so that lone bright pixels on black are found in log2 steps.
+static int halving_place(const double *along, int n, double total)
+{
+    double before = 0, best = INFINITY;
+    int place = 1;
+    for (int i = 1; i < n; i++) {
+        before += along[i - 1];
+        const double miss = fabs(before - (total - before));
+        if (miss < best || (miss == best && abs(2 * i - n) < abs(2 * place - n)))
+            best = miss, place = i;
+    }
+    return place;
+}
+
+// False: one pixel, or no energy.
+static bool split(const struct cutter *k, const struct light_region *r, struct light_region half[2])
+{
+    const int width = r->x1 - r->x0, height = r->y1 - r->y0;
+    const double elevation = M_PI / 2 - M_PI * (r->y0 + r->y1) / (2. * k->height);
+    const bool by_columns = height == 1 || (width > 1 && width * cos(elevation) >= height);
+    const double total = sum_along(k, r, by_columns);
+    if ((width == 1 && height == 1) || total <= 0)
+        return false;
+    const int place = halving_place(k->along, by_columns ? width : height, total);
+    half[0] = half[1] = *r;
+    if (by_columns)
+        half[0].x1 = half[1].x0 = r->x0 + place;
+    else
+        half[0].y1 = half[1].y0 = r->y0 + place;
+    return true;
+}
+
+static double angle_between(const double a[3],
+                            const double b[3]) // of unit vectors; exact for small angles
+{
+    const double d[3] = {a[0] - b[0], a[1] - b[1], a[2] - b[2]};
+    return 2 * asin(fmin(vec3_norm(d) / 2, 1));
+}
+
+// Fill light i from the pixels of its region.
+static void measure(const struct cutter *k, int i, const struct light_region *r)
+{
+    double *irradiance = k->out->irradiance[i], *dir = k->out->dir_probe[i];
+    double toward[3] = {0, 0, 0}, energy = 0; // sum of energy x direction, and of energy
+    k->out->region[i] = *r;
+    for (int y = r->y0; y < r->y1; y++) {
+        double row_rgb[3] = {0, 0, 0}, row_x = 0, row_z = 0, row = 0;
+        for (int x = r->x0; x < r->x1; x++) {
+            const float *rgb = pixel_at(k, x, y);
+            const double lum = luminance(rgb);
+            for (int c = 0; c < 3; c++)
+                row_rgb[c] += rgb[c];
+            row += lum, row_x += lum * k->sin_lon[x], row_z += lum * k->cos_lon[x];
+        }
+        for (int c = 0; c < 3; c++)
+            irradiance[c] += row_rgb[c] * k->omega[y];
+        energy += row * k->omega[y];
+        toward[0] += row_x * k->cos_lat[y] * k->omega[y];
+        toward[1] += row * k->sin_lat[y] * k->omega[y];
+        toward[2] += row_z * k->cos_lat[y] * k->omega[y];
+    }
+    panorama_direction(k->width, k->height, (r->x0 + r->x1) / 2., (r->y0 + r->y1) / 2., dir);
+    if (vec3_norm(toward) > 1e-9 * energy) { // else: no energy, or evenly all around
+        vec3_normalise(toward);
+        memcpy(dir, toward, sizeof(toward));
+    }
+    double sum = 0;
+    for (int y = r->y0; y < r->y1; y++) {
+        double row = 0;
+        for (int x = r->x0; x < r->x1; x++) {
+            const double lum = luminance(pixel_at(k, x, y));
+            if (lum <= 0)
+                continue;
+            const double d[3] = {k->sin_lon[x] * k->cos_lat[y], k->sin_lat[y],
+                                 k->cos_lon[x] * k->cos_lat[y]};
+            const double angle = angle_between(d, dir);
+            row += lum * angle * angle;
+        }
+        sum += row * k->omega[y];
+    }
+    k->out->spread_rad[i] = energy > 0 ? sqrt(sum / energy) : 0;
+}
+
+// The region becomes lights first .. first + n - 1. Depth 16 at most.
+static void cut(const struct cutter *k, const struct light_region *r, int first, int n)
+{
+    struct light_region half[2];
+    if (n > 1 && split(k, r, half)) {
+        cut(k, &half[0], first, n / 2);
+        cut(k, &half[1], first + n / 2, n / 2);
+        return;
+    }
+    measure(k, first, r);
+    for (int i = first + 1; i < first + n; i++) { // could not be split: the others are empty
+        k->out->region[i] = (struct light_region){r->x0, r->y0, r->x0, r->y0};
+        memcpy(k->out->dir_probe[i], k->out->dir_probe[first], sizeof(k->out->dir_probe[i]));
+    }
+}
+
+int lights_median_cut(struct lights *out, const struct panorama *p, int n)
+{
+    const int width = p->image.width, height = p->image.height;
+    struct lights l = {0};
+    memset(out, 0, sizeof(*out));
+    if (n < 1 || n > LIGHTS_MAX || (n & (n - 1))) {
+        log_error(
+            "lights: cannot cut a panorama into %d lights: expected a power of two from 1 to %d", n,
+            LIGHTS_MAX);
+        return -EINVAL;
+    }
+    int err = lights_new(&l, n);
+    double *tables = malloc(((size_t)width * 3 + (size_t)height * 3) *
+                            sizeof(double)); // along: max(width, height) = width
+    if (err || !tables)
+        goto no_memory;
+    l.region = calloc((size_t)n, sizeof(*l.region));
+    l.spread_rad = calloc((size_t)n, sizeof(*l.spread_rad));
+    if (!l.region || !l.spread_rad)
+        goto no_memory;
+    l.panorama_width_px = width, l.panorama_height_px = height;
+    const struct cutter k = {
+        .p = p,
+        .width = width,
+        .height = height,
+        .out = &l,
+        .sin_lon = tables,
+        .cos_lon = tables + width,
+        .along = tables + 2 * (size_t)width,
+        .sin_lat = tables + 3 * (size_t)width,
+        .cos_lat = tables + 3 * (size_t)width + height,
+        .omega = tables + 3 * (size_t)width + 2 * (size_t)height,
+    };
+    for (int x = 0; x < width; x++) {
+        const double lon = M_PI - 2 * M_PI * (x + .5) / width;
+        k.sin_lon[x] = sin(lon), k.cos_lon[x] = cos(lon);
+    }
+    for (int y = 0; y < height; y++) {
+        const double lat = M_PI / 2 - M_PI * (y + .5) / height;
+        k.sin_lat[y] = sin(lat), k.cos_lat[y] = cos(lat);
+        k.omega[y] = panorama_solid_angle(width, height, y);
+    }
+    cut(&k, &(struct light_region){0, 0, width, height}, 0, n);
+    free(tables);
+    *out = l;
+    return 0;
+no_memory:
+    free(tables);
+    lights_free(&l);
+    return -ENOMEM;
+}
+
+// ---- lights.json
+// --------------------------------------------------------------------------------------------------------
+
+static const char format_name[] = "studiorig-lights-1";
+
+static void light_position(const struct lights *l, int i, double pos_m[3]) // c + R dh / q
+{
+    double a[3];
+    mat3_mul_vec(a, l->world_from_probe, l->dir_probe[i]);
+    vec3_add_scaled(pos_m, l->centre_m, 1 / l->inverse_distance[i], a);
+}
+
+static struct json *light_to_json(const struct lights *l, int i)
+{
+    struct json *v = json_object();
+    const double q = l->inverse_distance[i];
+    json_set_numbers(v, "dir_probe", l->dir_probe[i], 3);
+    json_set_numbers(v, "irradiance", l->irradiance[i], 3);
+    json_set_number(v, "distance_m", q > 0 ? 1 / q : NAN); // not finite: null
+    if (q > 0) {
+        double pos_m[3];
+        light_position(l, i, pos_m);
+        json_set_numbers(v, "pos_m", pos_m, 3);
+    } else {
+        json_set_number(v, "pos_m", NAN);
+    }
+    json_set_int(v, "group", l->group[i]);
+    if (l->region) {
+        const struct light_region *r = &l->region[i];
+        json_set_numbers(v, "region", (double[]){r->x0, r->y0, r->x1, r->y1}, 4);
+    }
+    if (l->spread_rad)
+        json_set_number(v, "spread_rad", l->spread_rad[i]);
+    return v;
+}
+
+int lights_write_json(const struct lights *l, const char *path)
+{
+    struct json *doc = json_object(), *panorama = json_object(), *list = json_array();
+    json_set_string(doc, "format", format_name);
+    json_set_int(panorama, "width", l->panorama_width_px);
+    json_set_int(panorama, "height", l->panorama_height_px);
+    json_set(doc, "panorama", panorama);
+    json_set_numbers(doc, "centre_m", l->centre_m, 3);
+    json_set_matrix3(doc, "world_from_probe", l->world_from_probe);
+    for (int i = 0; i < l->n; i++)
+        json_append(list, light_to_json(l, i));
+    json_set(doc, "lights", list);
+    const int err = json_write(doc, path);
+    json_free(doc);
+    return err;
+}
+
+// What a number in a file may be: beyond this it is a mistake, and float kernels would overflow.
+static const double length_max_m = 1e9, distance_min_m = 1e-6, irradiance_max = 1e30;
+
+// null is the one value that the readers of json.h cannot tell.
+static bool is_null(const struct json *doc, const char *key)
+{
+    const struct json *v = json_get(doc, key);
+    char *text = v ? json_text(v) : NULL;
+    const bool null = text && !strcmp(text, "null");
+    free(text);
+    return null;
+}
+
+static int refuse(const char *file, const char *key, const char *what)
+{
+    log_error("lights: %s: %s %s", file, key, what);
+    return -EINVAL;
+}
+
+enum { KEY_MAX = 64 };
+static const char *light_key(char key[KEY_MAX], int i, const char *name)
+{
+    snprintf(key, KEY_MAX, "lights.%d.%s", i, name);
+    return key;
+}
+
+static int read_place(struct lights *l, const struct json *doc, const char *file)
+{
+    int err = json_require_numbers(doc, "centre_m", l->centre_m, 3, file);
+    if (!err)
+        err = json_require_numbers(doc, "world_from_probe", l->world_from_probe, 9, file);
+    if (err)
+        return err;
+    for (int k = 0; k < 3; k++)
+        if (!(fabs(l->centre_m[k]) <= length_max_m))
+            return refuse(file, "centre_m", "is more than 1e9 m away: expected metres");
+    const double *R = l->world_from_probe;
+    for (int i = 0; i < 3; i++)
+        for (int j = i; j < 3; j++)
+            if (!(fabs(vec3_dot(R + 3 * i, R + 3 * j) - (i == j)) <= 1e-6))
+                return refuse(file, "world_from_probe",
+                              "is not a rotation: its rows are not orthonormal to 1e-6");
+    if (mat3_det(R) < 0)
+        return refuse(file, "world_from_probe",
+                      "is mirrored (determinant -1): expected a rotation; mirror the panorama, "
+                      "not the rotation");
+    return 0;
+}
+
+static int read_panorama_size(struct lights *l, const struct json *doc, const char *file)
+{
+    int64_t width = 0, height = 0;
+    if (!json_get(doc, "panorama") || is_null(doc, "panorama"))
+        return 0;
+    if (json_get_int(doc, "panorama.width", &width) ||
+        json_get_int(doc, "panorama.height", &height) || width < 0 || width > 65536 ||
+        width != 2 * height)
+        return refuse(file, "panorama",
+                      "must have integers width = 2 x height, at most 65536 (or 0: no panorama)");
+    l->panorama_width_px = (int)width, l->panorama_height_px = (int)height;
+    return 0;
+}
+
+static int read_distance(struct lights *l, int i, const struct json *doc, const char *file)
+{
+    char key[KEY_MAX];
+    double distance_m, pos_m[3], expected[3];
+    light_key(key, i, "distance_m");
+    if (is_null(doc, key))
+        return 0; // directional, as lights_new() left it
+    const int err = json_require_numbers(doc, key, &distance_m, 1, file);
+    if (err)
+        return err;
+    if (!(distance_m >= distance_min_m))
+        return refuse(file, key,
+                      "is below 1e-6 m: expected metres, or null for a directional light");
+    l->inverse_distance[i] = 1 / distance_m;
+
+    light_key(key, i, "pos_m"); // says again what centre, rotation, direction and distance say: an
+                                // edit must be of both
+    if (!json_get(doc, key) || is_null(doc, key))
+        return 0;
+    const int pos_err = json_require_numbers(doc, key, pos_m, 3, file);
+    if (pos_err)
+        return pos_err;
+    light_position(l, i, expected);
+    vec3_sub(pos_m, pos_m, expected);
+    if (!(vec3_norm(pos_m) <= 1e-5 * (distance_m + vec3_norm(l->centre_m) + 1)))
+        return refuse(file, key,
+                      "is not centre_m + distance_m x world_from_probe x dir_probe: correct it, or "
+                      "leave it out");
+    return 0;
+}
+
+static int read_light(struct lights *l, int i, const struct json *doc, const char *file)
+{
+    char key[KEY_MAX];
+    double *dir = l->dir_probe[i];
+    int err = json_require_numbers(doc, light_key(key, i, "dir_probe"), dir, 3, file);
+    if (err)
+        return err;
+    const double length = vec3_norm(dir);
+    if (!(fabs(length - 1) <= 1e-6))
+        return refuse(file, key, "is not a unit vector (to 1e-6)");
+    if (fabs(length - 1) > 1e-15) // else it is one to rounding: keep every bit
+        vec3_normalise(dir);
+
+    err = json_require_numbers(doc, light_key(key, i, "irradiance"), l->irradiance[i], 3, file);
+    if (err)
+        return err;
+    for (int c = 0; c < 3; c++)
+        if (!(l->irradiance[i][c] >= 0 && l->irradiance[i][c] <= irradiance_max))
+            return refuse(file, key, "has a channel outside [0, 1e30]");
+    err = read_distance(l, i, doc, file);
+    if (err)
+        return err;
+
+    int64_t group = -1;
+    light_key(key, i, "group");
+    if (json_get(doc, key) && !is_null(doc, key) &&
+        (json_get_int(doc, key, &group) || group < -1 || group >= l->n))
+        return refuse(file, key,
+                      "must be the number of an emitter (0 .. lights - 1), or -1 for none");
+    l->group[i] = (int32_t)group;
+
+    if (l->region) {
+        double edge[4]; // x0, y0, x1, y1
+        const double limit[4] = {l->panorama_width_px, l->panorama_height_px, l->panorama_width_px,
+                                 l->panorama_height_px};
+        err = json_require_numbers(doc, light_key(key, i, "region"), edge, 4, file);
+        if (err)
+            return err;
+        for (int k = 0; k < 4; k++)
+            if (!(edge[k] >= 0 && edge[k] <= limit[k] && edge[k] == floor(edge[k])) ||
+                edge[k] < edge[k % 2])
+                return refuse(
+                    file, key,
+                    "must be pixels x0, y0, x1, y1 inside the panorama, x0 <= x1, y0 <= y1");
+        l->region[i] =
+            (struct light_region){(int)edge[0], (int)edge[1], (int)edge[2], (int)edge[3]};
+    }
+    if (l->spread_rad) {
+        err =
+            json_require_numbers(doc, light_key(key, i, "spread_rad"), &l->spread_rad[i], 1, file);
+        if (err)
+            return err;
+        if (!(l->spread_rad[i] >= 0 && l->spread_rad[i] <= M_PI))
+            return refuse(file, key, "is outside [0, pi]");
+    }
+    return 0;
+}
+
+static int from_json(struct lights *out, const struct json *doc, const char *file)
+{
+    struct lights l = {0};
+    const char *format;
+    int err = json_require_string(doc, "format", &format, file);
+    if (err)
+        goto fail;
+    if (strcmp(format, format_name)) {
+        err = refuse(file, "format", "is not \"studiorig-lights-1\"");
+        goto fail;
+    }
+    const int n = json_length(doc, "lights");
+    if (n < 1 || n > LIGHTS_MAX) {
+        log_error("lights: %s: lights: expected a list of 1 to %d lights, found %s", file,
+                  LIGHTS_MAX,
+                  n > 0    ? "more"
+                  : n == 0 ? "none"
+                           : "no list");
+        err = -EINVAL;
+        goto fail;
+    }
+    err = lights_new(&l, n);
+    if (err)
+        goto fail;
+    const bool regions = json_get(doc, "lights.0.region"),
+               spreads = json_get(doc, "lights.0.spread_rad");
+    l.region = regions ? calloc((size_t)n, sizeof(*l.region)) : NULL;
+    l.spread_rad = spreads ? calloc((size_t)n, sizeof(*l.spread_rad)) : NULL;
+    err = (regions && !l.region) || (spreads && !l.spread_rad) ? -ENOMEM : 0;
+    if (!err)
+        err = read_place(&l, doc, file);
+    if (!err)
+        err = read_panorama_size(&l, doc, file);
+    for (int i = 0; i < n && !err; i++)
+        err = read_light(&l, i, doc, file);
+    if (err)
+        goto fail;
+    *out = l;
+    return 0;
+fail:
+    lights_free(&l);
+    return err == -ENOENT ? -EINVAL
+                          : err; // a missing key is a broken file; -ENOENT says there is none
+}
+
+int lights_parse_json(struct lights *out, const char *text, size_t n_bytes,
+                      const char *name_for_errors)
+{
+    struct json *doc;
+    memset(out, 0, sizeof(*out));
+    int err = json_parse(&doc, text, n_bytes, name_for_errors);
+    if (err)
+        return err;
+    err = from_json(out, doc, name_for_errors);
+    json_free(doc);
+    return err;
+}
+
+int lights_read_json(struct lights *out, const char *path)
+{
+    struct json *doc;
+    memset(out, 0, sizeof(*out));
+    int err = json_read(&doc, path);
+    if (err)
+        return err;
+    err = from_json(out, doc, path);
+    json_free(doc);
+    return err;
+}

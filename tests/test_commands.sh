@@ -1,0 +1,113 @@
+#!/bin/sh
+# tests/test_commands.sh - rigsolve as a user meets it: every command on a small studio, exit codes, bad input. Prints TAP.
+# Run from the repository root; BIN is where rigsolve lies.
+set -u
+rigsolve=${BIN:-build/bin}/rigsolve
+dir=$(mktemp -d "${TMPDIR:-/tmp}/studiorig-test-XXXXXX") || exit 1
+trap 'rm -rf "$dir"' EXIT
+n=0 failed=0
+result() { # status, name
+    n=$((n + 1))
+    if [ "$1" = 0 ]; then
+        echo "ok $n - $2"
+    else
+        failed=1
+        echo "not ok $n - $2"
+        sed 's/^/#   /' "$dir/log" | tail -n 15
+    fi
+}
+# gives CODE NAME COMMAND...: the command ends with that exit code
+gives() {
+    code=$1 name=$2
+    shift 2
+    "$@" >"$dir/log" 2>&1 </dev/null
+    got=$?
+    [ "$got" = "$code" ] || echo "exit code $got, expected $code: $*" >>"$dir/log"
+    [ "$got" = "$code" ]
+    result $? "$name"
+}
+# refuses NAME PATTERN COMMAND...: exit code 1, and the message says what the pattern says; nothing on the final name $dir/refused
+refuses() {
+    name=$1 pattern=$2
+    shift 2
+    "$@" >"$dir/log" 2>&1 </dev/null
+    got=$?
+    [ "$got" = 1 ] && grep -qiE "$pattern" "$dir/log" && [ ! -e "$dir/refused" ]
+    result $? "$name"
+}
+json_has() { # file, perl expression on $d
+    perl -MJSON::PP -0777 -ne '$d = decode_json($_); exit(('"$2"') ? 0 : 1)' "$1" >>"$dir/log" 2>&1
+}
+sums() { # content of a folder, without names of where it is
+    (cd "$1" && find . -type f ! -name take.json ! -name report.json | LC_ALL=C sort | xargs cksum)
+}
+
+gives 0 "help" "$rigsolve" --help
+gives 0 "version" "$rigsolve" --version
+gives 2 "no command is a usage error" "$rigsolve"
+gives 2 "an unknown command is a usage error" "$rigsolve" paint
+for c in brdf lights visibility synth render compare; do
+    gives 0 "$c --help" "$rigsolve" $c --help
+    gives 2 "$c without arguments is a usage error" "$rigsolve" $c
+    gives 2 "$c with an unknown option is a usage error" "$rigsolve" $c --no-such-option
+done
+
+small="--size 60x40 --views 10 --true-lights 256 --texture 64 --panorama-width 256 --samples 1"
+gives 0 "synth makes a studio" "$rigsolve" synth D3 -o "$dir/one" --seed 7 --threads 1 $small
+gives 0 "synth makes it again with other threads" "$rigsolve" synth D3 -o "$dir/two" --seed 7 --threads 3 $small
+sums "$dir/one" >"$dir/sums1" && sums "$dir/two" >"$dir/sums2" && [ -s "$dir/sums1" ] && cmp "$dir/sums1" "$dir/sums2" >"$dir/log" 2>&1
+result $? "same seed, same bytes, whatever the thread count"
+gives 1 "synth does not write into a folder that has something" "$rigsolve" synth D3 -o "$dir/one" $small
+gives 2 "synth names a data set it does not know" "$rigsolve" synth D9 -o "$dir/refused"
+
+gives 0 "lights" "$rigsolve" lights "$dir/one/panorama.exr" -n 64 -o "$dir/lights.json" --overlay "$dir/lights.png"
+json_has "$dir/lights.json" '@{$d->{lights}} == 64 && @{$d->{lights}[0]{irradiance}} == 3'
+result $? "lights.json lists 64 lights"
+gives 2 "lights refuses a count that is no power of two" "$rigsolve" lights "$dir/one/panorama.exr" -n 100 -o "$dir/refused"
+gives 0 "visibility of a take" "$rigsolve" visibility "$dir/one" -o "$dir/vis" --texture 64 --lights 64
+[ -s "$dir/vis/visibility/cam000.png" ] && [ -s "$dir/vis/visibility/lights.bin" ]
+result $? "visibility leaves one mask per view and the light bits"
+gives 0 "render of the truth by the take's cameras" "$rigsolve" render "$dir/one/truth" --cameras "$dir/one/geometry/cameras" \
+    -o "$dir/views" --samples 1
+"$rigsolve" compare "$dir/views" "$dir/one/linear" --json >"$dir/compare.json" 2>"$dir/log"
+result $? "compare of two folders"
+json_has "$dir/compare.json" '$d->{rmse_percent} < .1 || print "RMSE $d->{rmse_percent} %\n"'
+result $? "the render of the truth is what synth wrote, to the rounding of half floats"
+
+# Input as it comes from the world
+head -c 2000 "$dir/one/panorama.exr" >"$dir/cut.exr"
+refuses "a truncated EXR is refused by name" 'cut\.exr' "$rigsolve" lights "$dir/cut.exr" -n 64 -o "$dir/refused"
+refuses "a view is no panorama: not 2:1" 'cam000\.exr.*2:1' "$rigsolve" lights "$dir/one/linear/cam000.exr" -n 64 -o "$dir/refused"
+refuses "a missing file is named" 'nowhere\.exr' "$rigsolve" lights "$dir/nowhere.exr" -n 64 -o "$dir/refused"
+printf '#?RADIANCE\nFORMAT=32-bit_rle_rgbe\n\n-Y 2 +X 4\n' >"$dir/black.hdr"
+head -c 32 /dev/zero >>"$dir/black.hdr"
+refuses "an all-black panorama is refused" 'black\.hdr.*black' "$rigsolve" lights "$dir/black.hdr" -n 2 -o "$dir/refused"
+cameras="$dir/one/geometry/cameras"
+vis() { "$rigsolve" visibility --mesh "$1" --cameras "$2" -o "$dir/refused" --texture 32; }
+grep -v '^vt' "$dir/one/geometry/mesh.obj" | sed 's,/[0-9]*/,//,g' >"$dir/nouv.obj"
+refuses "a mesh without UVs is refused" 'nouv\.obj.*UV' vis "$dir/nouv.obj" "$cameras"
+lines=$(wc -l <"$dir/one/geometry/mesh.obj")
+head -n $((lines - 5)) "$dir/one/geometry/mesh.obj" >"$dir/cut.obj" && printf 'f 1/1/1 2/' >>"$dir/cut.obj"
+refuses "a truncated OBJ is refused with its line" "cut\.obj:$((lines - 4))" vis "$dir/cut.obj" "$cameras"
+mkdir -p "$dir/cutcams" && cp "$cameras"/*.txt "$dir/cutcams" && head -c 700 "$cameras/images.txt" >"$dir/cutcams/images.txt"
+refuses "truncated cameras are refused by file" 'images\.txt' vis "$dir/one/geometry/mesh.obj" "$dir/cutcams"
+sed 's/^v [^ ]*/v nan/' "$dir/one/geometry/mesh.obj" >"$dir/nan.obj"
+refuses "NaN positions are refused" 'nan\.obj' vis "$dir/nan.obj" "$cameras"
+printf 'n_x,n_y\n1,0\n' >"$dir/cases.csv"
+refuses "a table of cases without its columns is refused" 'cases\.csv.*column' "$rigsolve" brdf "$dir/cases.csv"
+mkdir -p "$dir/away" && sed -E '/^#/!{/^[0-9]/s/^([0-9]+ [^ ]+ [^ ]+ [^ ]+ [^ ]+) [^ ]+ [^ ]+ [^ ]+/\1 0 0 -500/}' "$cameras/images.txt" >"$dir/away/images.txt"
+cp "$cameras/cameras.txt" "$cameras/points3D.txt" "$dir/away"
+gives 3 "cameras that do not see the mesh: done, but not to be trusted" "$rigsolve" visibility --mesh "$dir/one/geometry/mesh.obj" \
+    --cameras "$dir/away" -o "$dir/away/out" --texture 32
+
+# A writer that is killed leaves nothing under the final name
+"$rigsolve" synth D3 -o "$dir/killed" --size 600x400 --true-lights 4096 >/dev/null 2>&1 &
+pid=$!
+sleep 1
+kill -9 $pid 2>/dev/null
+wait $pid 2>/dev/null
+: >"$dir/log"
+[ ! -e "$dir/killed" ]
+result $? "a killed synth leaves no folder that looks finished"
+echo "1..$n"
+exit $failed
