@@ -1,8 +1,8 @@
 // solver/lights.c - cutting a panorama into lights, their irradiance at a point with derivatives,
 // and lights.json.
 //
-// Letters (paper, Eqs. 1-4): dh probe direction, C irradiance, c centre, R world_from_probe, q =
-// 1/r.
+// Letters (paper, Eqs. 1-4): dh probe direction, C irradiance, c centre, R world_from_probe, and
+// q = 1/r. All others: NOTATION.md.
 #include "solver/lights.h"
 #include "solver/take/log.h"
 #include "solver/vec3.h"
@@ -14,8 +14,7 @@
 #include <stdlib.h>
 #include <string.h>
 
-// ---- memory
-// -------------------------------------------------------------------------------------------------------------
+// ---- memory -------------------------------------------------------------------------------------
 
 int lights_new(struct lights *out, int n)
 {
@@ -52,8 +51,7 @@ void lights_free(struct lights *l)
     memset(l, 0, sizeof(*l));
 }
 
-// ---- one light at one point (Eqs. 1-4)
-// ----------------------------------------------------------------------------------
+// ---- one light at one point (Eqs. 1-4) ----------------------------------------------------------
 //
 //   a = R dh,  u = a + q (c - p),  s = |u|,  l = u / s,  weight = max(<u, a>, 0) / s^3
 //
@@ -94,8 +92,8 @@ void light_at_point(const struct lights *l, int i, const double point_m[3], stru
 
 // By the chain rule over u and a, with m = <u, a>:
 //   dl/du = (I - l l^T)/s,  dweight/du = a/s^3 - 3 m u/s^5,  dweight/da = u/s^3
-//   du/dc = q I,  du/dp = -q I,  du/dq = c - p,  da/dw = du/dw = -[a]x  (R = exp([w]x) R0, so a
-//   moves by w x a)
+//   du/dc = q I,  du/dp = -q I,  du/dq = c - p
+//   da/dw = du/dw = -[a]x, for R = exp([w]x) R0 moves a by w x a
 void light_at_point_gradient(const struct lights *l, int i, const double point_m[3],
                              struct light_at_gradient *out)
 {
@@ -127,15 +125,14 @@ void light_at_point_gradient(const struct lights *l, int i, const double point_m
     out->weight_inverse_distance = vec3_dot(weight_u, c_minus_p);
 }
 
-// ---- median cut
-// ---------------------------------------------------------------------------------------------------------
+// ---- median cut ---------------------------------------------------------------------------------
 
 struct cutter {
     const struct panorama *p;
     int width, height;
     double *sin_lon, *cos_lon;         // [width] of pixel centres
     double *sin_lat, *cos_lat, *omega; // [height]; omega: solid angle of the row's pixels
-    double *along; // [max(width, height)] energy of each column or row of one region
+    double *along; // [width] energy of each column or row of one region
     struct lights *out;
 };
 
@@ -205,8 +202,8 @@ static bool split(const struct cutter *k, const struct light_region *r, struct l
     return true;
 }
 
-static double angle_between(const double a[3],
-                            const double b[3]) // of unit vectors; exact for small angles
+// Of unit vectors; exact for small angles.
+static double angle_between(const double a[3], const double b[3])
 {
     const double d[3] = {a[0] - b[0], a[1] - b[1], a[2] - b[2]};
     return 2 * asin(fmin(vec3_norm(d) / 2, 1));
@@ -278,14 +275,13 @@ int lights_median_cut(struct lights *out, const struct panorama *p, int n)
     struct lights l = {0};
     memset(out, 0, sizeof(*out));
     if (n < 1 || n > LIGHTS_MAX || (n & (n - 1))) {
-        log_error(
-            "lights: cannot cut a panorama into %d lights: expected a power of two from 1 to %d", n,
-            LIGHTS_MAX);
+        log_error("lights: cannot cut a panorama into %d lights: expected a power of two from 1 "
+                  "to %d",
+                  n, LIGHTS_MAX);
         return -EINVAL;
     }
     int err = lights_new(&l, n);
-    double *tables = malloc(((size_t)width * 3 + (size_t)height * 3) *
-                            sizeof(double)); // along: max(width, height) = width
+    double *tables = malloc(((size_t)width * 3 + (size_t)height * 3) * sizeof(double));
     if (err || !tables)
         goto no_memory;
     l.region = calloc((size_t)n, sizeof(*l.region));
@@ -324,8 +320,7 @@ no_memory:
     return -ENOMEM;
 }
 
-// ---- lights.json
-// --------------------------------------------------------------------------------------------------------
+// ---- lights.json --------------------------------------------------------------------------------
 
 static const char format_name[] = "studiorig-lights-1";
 

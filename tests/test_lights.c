@@ -37,8 +37,7 @@ static void random_unit(double out[3], uint64_t stream, uint64_t i)
     vec3_normalise(out);
 }
 
-// ---- Eqs. 1-4
-// -----------------------------------------------------------------------------------------------------------
+// ---- Eqs. 1-4 -----------------------------------------------------------------------------------
 
 // n lights about a centre off the origin, turned; every fourth directional.
 static struct lights near_lights(int n)
@@ -225,8 +224,7 @@ static void behind_and_at_a_light_there_is_no_light(void **state)
     lights_free(&l);
 }
 
-// ---- median cut
-// ---------------------------------------------------------------------------------------------------------
+// ---- median cut ---------------------------------------------------------------------------------
 
 static struct panorama black(int height)
 {
@@ -429,8 +427,32 @@ static void what_cannot_be_split_gives_empty_lights(void **state)
     panorama_free(&p);
 }
 
-// ---- lights.json
-// --------------------------------------------------------------------------------------------------------
+static void photographed_studios_keep_their_energy(void **state)
+{
+    (void)state;
+    static const char *const files[] = {"studio_small_03_1k.hdr", "brown_photostudio_02_1k.hdr",
+                                        "OrientationLatLong.exr"};
+    for (int f = 0; f < 3; f++) {
+        char path[256];
+        snprintf(path, sizeof(path), "../shared/data/hdri/%s", files[f]);
+        if (access(path, R_OK)) {
+            print_message("# %s is not there: not checked\n", path);
+            continue;
+        }
+        struct panorama p;
+        assert_int_equal(panorama_read(&p, path), 0);
+        for (int n = 16; n <= 4096; n *= 16) {
+            struct lights l;
+            assert_int_equal(lights_median_cut(&l, &p, n), 0);
+            assert_partition(&l);
+            assert_same_energy(&l, &p, 1e-12);
+            lights_free(&l);
+        }
+        panorama_free(&p);
+    }
+}
+
+// ---- lights.json --------------------------------------------------------------------------------
 
 static char folder[64]; // of this run, removed at the end
 
@@ -649,8 +671,7 @@ static void what_a_hand_may_write_is_read(void **state)
     lights_free(&l);
 }
 
-// ---- the path-traced studios
-// ------------------------------------------------------------------------------------------
+// ---- the path-traced studios --------------------------------------------------------------------
 
 static const char *const studios[] = {"../shared/data/studio-pebble", "../shared/data/studio-vase"};
 enum { N_STUDIOS = 2, MAX_PANELS = 16 };
@@ -997,6 +1018,7 @@ int main(void)
         cmocka_unit_test(lone_bright_pixels_on_black_get_one_light_each),
         cmocka_unit_test(direction_and_spread_are_energy_weighted),
         cmocka_unit_test(what_cannot_be_split_gives_empty_lights),
+        cmocka_unit_test(photographed_studios_keep_their_energy),
         cmocka_unit_test(lights_survive_a_file_bit_for_bit),
         cmocka_unit_test(wrong_lights_are_refused_by_name),
         cmocka_unit_test(more_lights_than_the_limit_are_refused),
