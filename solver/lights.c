@@ -132,7 +132,7 @@ struct cutter {
     int width, height;
     double *sin_lon, *cos_lon;         // [width] of pixel centres
     double *sin_lat, *cos_lat, *omega; // [height]; omega: solid angle of the row's pixels
-    double *along; // [width] energy of each column or row of one region
+    double *along;                     // [width] energy of each column or row of one region
     struct lights *out;
 };
 
@@ -385,9 +385,12 @@ static bool is_null(const struct json *doc, const char *key)
     return null;
 }
 
-static int refuse(const char *file, const char *key, const char *what)
+static int refuse(const char *file, const struct json *doc, const char *key, const char *what)
 {
-    log_error("lights: %s: %s %s", file, key, what);
+    char *found = json_text(json_get(doc, key));
+    log_error("lights: %s: %s: found %.80s%s: %s", file, key, found ? found : "?",
+              found && strlen(found) > 80 ? "..." : "", what);
+    free(found);
     return -EINVAL;
 }
 
@@ -407,15 +410,15 @@ static int read_place(struct lights *l, const struct json *doc, const char *file
         return err;
     for (int k = 0; k < 3; k++)
         if (!(fabs(l->centre_m[k]) <= length_max_m))
-            return refuse(file, "centre_m", "is more than 1e9 m away: expected metres");
+            return refuse(file, doc, "centre_m", "more than 1e9 m away; expected metres");
     const double *R = l->world_from_probe;
     for (int i = 0; i < 3; i++)
         for (int j = i; j < 3; j++)
             if (!(fabs(vec3_dot(R + 3 * i, R + 3 * j) - (i == j)) <= 1e-6))
-                return refuse(file, "world_from_probe",
-                              "is not a rotation: its rows are not orthonormal to 1e-6");
+                return refuse(file, doc, "world_from_probe",
+                              "not a rotation: its rows are not orthonormal to 1e-6");
     if (mat3_det(R) < 0)
-        return refuse(file, "world_from_probe",
+        return refuse(file, doc, "world_from_probe",
                       "is mirrored (determinant -1): expected a rotation; mirror the panorama, "
                       "not the rotation");
     return 0;
@@ -429,8 +432,8 @@ static int read_panorama_size(struct lights *l, const struct json *doc, const ch
     if (json_get_int(doc, "panorama.width", &width) ||
         json_get_int(doc, "panorama.height", &height) || width < 0 || width > 65536 ||
         width != 2 * height)
-        return refuse(file, "panorama",
-                      "must have integers width = 2 x height, at most 65536 (or 0: no panorama)");
+        return refuse(file, doc, "panorama",
+                      "expected integers width = 2 x height, at most 65536 (0: no panorama)");
     l->panorama_width_px = (int)width, l->panorama_height_px = (int)height;
     return 0;
 }
@@ -446,12 +449,12 @@ static int read_distance(struct lights *l, int i, const struct json *doc, const 
     if (err)
         return err;
     if (!(distance_m >= distance_min_m))
-        return refuse(file, key,
-                      "is below 1e-6 m: expected metres, or null for a directional light");
+        return refuse(file, doc, key,
+                      "below 1e-6 m; expected metres, or null for a directional light");
     l->inverse_distance[i] = 1 / distance_m;
 
-    light_key(key, i, "pos_m"); // says again what centre, rotation, direction and distance say: an
-                                // edit must be of both
+    // It says again what centre, rotation, direction and distance say: an edit must be of both.
+    light_key(key, i, "pos_m");
     if (!json_get(doc, key) || is_null(doc, key))
         return 0;
     const int pos_err = json_require_numbers(doc, key, pos_m, 3, file);
@@ -460,7 +463,7 @@ static int read_distance(struct lights *l, int i, const struct json *doc, const 
     light_position(l, i, expected);
     vec3_sub(pos_m, pos_m, expected);
     if (!(vec3_norm(pos_m) <= 1e-5 * (distance_m + vec3_norm(l->centre_m) + 1)))
-        return refuse(file, key,
+        return refuse(file, doc, key,
                       "is not centre_m + distance_m x world_from_probe x dir_probe: correct it, or "
                       "leave it out");
     return 0;
@@ -475,7 +478,7 @@ static int read_light(struct lights *l, int i, const struct json *doc, const cha
         return err;
     const double length = vec3_norm(dir);
     if (!(fabs(length - 1) <= 1e-6))
-        return refuse(file, key, "is not a unit vector (to 1e-6)");
+        return refuse(file, doc, key, "not a unit vector (to 1e-6)");
     if (fabs(length - 1) > 1e-15) // else it is one to rounding: keep every bit
         vec3_normalise(dir);
 
@@ -484,7 +487,7 @@ static int read_light(struct lights *l, int i, const struct json *doc, const cha
         return err;
     for (int c = 0; c < 3; c++)
         if (!(l->irradiance[i][c] >= 0 && l->irradiance[i][c] <= irradiance_max))
-            return refuse(file, key, "has a channel outside [0, 1e30]");
+            return refuse(file, doc, key, "a channel is outside [0, 1e30]");
     err = read_distance(l, i, doc, file);
     if (err)
         return err;
@@ -493,7 +496,7 @@ static int read_light(struct lights *l, int i, const struct json *doc, const cha
     light_key(key, i, "group");
     if (json_get(doc, key) && !is_null(doc, key) &&
         (json_get_int(doc, key, &group) || group < -1 || group >= l->n))
-        return refuse(file, key,
+        return refuse(file, doc, key,
                       "must be the number of an emitter (0 .. lights - 1), or -1 for none");
     l->group[i] = (int32_t)group;
 
@@ -508,7 +511,7 @@ static int read_light(struct lights *l, int i, const struct json *doc, const cha
             if (!(edge[k] >= 0 && edge[k] <= limit[k] && edge[k] == floor(edge[k])) ||
                 edge[k] < edge[k % 2])
                 return refuse(
-                    file, key,
+                    file, doc, key,
                     "must be pixels x0, y0, x1, y1 inside the panorama, x0 <= x1, y0 <= y1");
         l->region[i] =
             (struct light_region){(int)edge[0], (int)edge[1], (int)edge[2], (int)edge[3]};
@@ -519,7 +522,7 @@ static int read_light(struct lights *l, int i, const struct json *doc, const cha
         if (err)
             return err;
         if (!(l->spread_rad[i] >= 0 && l->spread_rad[i] <= M_PI))
-            return refuse(file, key, "is outside [0, pi]");
+            return refuse(file, doc, key, "outside [0, pi]");
     }
     return 0;
 }
@@ -532,7 +535,7 @@ static int from_json(struct lights *out, const struct json *doc, const char *fil
     if (err)
         goto fail;
     if (strcmp(format, format_name)) {
-        err = refuse(file, "format", "is not \"studiorig-lights-1\"");
+        err = refuse(file, doc, "format", "expected \"studiorig-lights-1\"");
         goto fail;
     }
     const int n = json_length(doc, "lights");
@@ -565,8 +568,8 @@ static int from_json(struct lights *out, const struct json *doc, const char *fil
     return 0;
 fail:
     lights_free(&l);
-    return err == -ENOENT ? -EINVAL
-                          : err; // a missing key is a broken file; -ENOENT says there is none
+    // A missing key is a broken file; -ENOENT would say that there is no file.
+    return err == -ENOENT ? -EINVAL : err;
 }
 
 int lights_parse_json(struct lights *out, const char *text, size_t n_bytes,

@@ -371,6 +371,27 @@ static void lone_bright_pixels_on_black_get_one_light_each(void **state)
     panorama_free(&p);
 }
 
+static void a_lone_bright_pixel_is_found_in_log2_steps(void **state)
+{
+    (void)state;
+    struct panorama p = black(64);
+    struct lights l;
+    p.image.data[3 * (128 * 41 + 77)] = 1;
+    assert_int_equal(lights_median_cut(&l, &p, 128 * 64), 0);
+    assert_partition(&l);
+    int n_lit = 0;
+    for (int i = 0; i < l.n; i++) {
+        const struct light_region *r = &l.region[i];
+        if (l.irradiance[i][0] <= 0)
+            continue;
+        n_lit++;
+        assert_true(r->x0 == 77 && r->x1 == 78 && r->y0 == 41 && r->y1 == 42);
+    }
+    assert_int_equal(n_lit, 1);
+    lights_free(&l);
+    panorama_free(&p);
+}
+
 static void direction_and_spread_are_energy_weighted(void **state)
 {
     (void)state;
@@ -1016,6 +1037,7 @@ int main(void)
         cmocka_unit_test(regions_partition_the_panorama_and_keep_its_energy),
         cmocka_unit_test(every_region_is_halved_along_its_longer_side_at_the_best_place),
         cmocka_unit_test(lone_bright_pixels_on_black_get_one_light_each),
+        cmocka_unit_test(a_lone_bright_pixel_is_found_in_log2_steps),
         cmocka_unit_test(direction_and_spread_are_energy_weighted),
         cmocka_unit_test(what_cannot_be_split_gives_empty_lights),
         cmocka_unit_test(photographed_studios_keep_their_energy),

@@ -260,6 +260,7 @@ static void negative_light_becomes_none_with_a_count(void **state)
     p.image.data[3 * 77 + 2] = -1e-3f;
     assert_int_equal(read_back(&back, &p.image), 0);
     assert_non_null(strstr(last_warning, "2 negative"));
+    assert_non_null(strstr(last_warning, "-0.25")); // the lowest
     assert_non_null(strstr(last_warning, "column 4, row 1")); // pixel 20 of 16 columns
     assert_true(back.image.data[3 * 20 + 1] == 0 && back.image.data[3 * 77 + 2] == 0);
     assert_true(back.image.data[3 * 20] == 1);
