@@ -9,3 +9,12 @@
 int64_t mesh_number_distinct(uint32_t *ids, const void *items, size_t n_words, size_t n);
 
 bool mesh_triangle_has_area(const struct mesh *mesh, int triangle); // in 3-D
+
+// A mesh file in memory; bytes[n_bytes] is NUL.
+struct mesh_file {
+    const char *path, *bytes;
+    size_t n_bytes;
+};
+// Finds the format by content and checks counts, ranges and lengths before a library sees the bytes. 0 and *format (a number for
+// mesh_import.c), -EINVAL, -ENOTSUP, -ENOMEM; logged.
+int mesh_check_file(const struct mesh_file *f, int *format);

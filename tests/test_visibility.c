@@ -91,7 +91,7 @@ static void texels_outside_the_image_or_behind_the_camera_are_outside(void **sta
 {
     (void)state;
     struct scene s = scene_of(ray_mesh_sphere(48, 24), 64);
-    const struct camera camera = camera_at((const double[3]){ 3, 1, 2 }, (const double[3]){ 1, 0, 0 }, 600);
+    const struct camera camera = camera_at((const double[3]){ 3, 1, 2 }, (const double[3]){ 0 }, 600); // beyond all four borders
     uint8_t *mask = mask_of(&s, &camera, 1);
     int n_outside = 0;
     for (int i = 0; i < s.texels.n; i++) {
