@@ -583,11 +583,13 @@ static void a_large_black_picture_is_not_taken_for_an_attack(void **state)
 {
     (void)state;
     struct image image, back;
-    assert_int_equal(image_new(&image, 6000, 4000, 1, NULL), 0);
+    assert_int_equal(image_new(&image, 7000, 6400, 1, NULL), 0); // 85 MiB of halves in 100 kB
     assert_int_equal(image_write_exr(&image, in_folder("black.exr"), IMAGE_HALF, IMAGE_ZIP), 0);
     assert_int_equal(image_read(&back, in_folder("black.exr")), 0);
-    assert_int_equal(back.width, 6000);
+    assert_int_equal(back.width, 7000);
     image_free(&back);
+    image_free(&image);
+    assert_int_equal(image_new(&image, 6000, 4000, 1, NULL), 0);
     assert_int_equal(image_write_png_srgb(&image, in_folder("black.png"), 0), 0);
     assert_int_equal(image_read(&back, in_folder("black.png")), 0);
     image_free(&back);
@@ -1026,6 +1028,23 @@ static void half_a_picture_is_never_taken_for_a_whole_one(void **state)
     }
 }
 
+static void damaged_pixels_of_a_tiff_are_named_by_their_place(void **state)
+{
+    (void)state;
+    static const char *const kinds[] = { "deflate.tif", "lzw.tif", "tile.tif" };
+    for (int k = 0; k < 3; k++) {
+        uint8_t *bytes;
+        size_t n;
+        struct image image;
+        make_sample(kinds[k], &bytes, &n);
+        memset(bytes + 8 + 20, 0xff, 60); // the pixels follow the header of 8 bytes
+        assert_int_equal(read_exactly(&image, bytes, n), -EINVAL);
+        assert_logged("memory", k == 2 ? "tile at column 0, row 0" : ": row ");
+        assert_null(image.data);
+        free(bytes);
+    }
+}
+
 static void no_damaged_byte_crashes_a_reader(void **state)
 {
     (void)state;
@@ -1262,6 +1281,7 @@ int main(void)
         cmocka_unit_test(tone_mapped_png_follows_the_srgb_curve),
         cmocka_unit_test(every_truncation_is_refused_with_one_line),
         cmocka_unit_test(half_a_picture_is_never_taken_for_a_whole_one),
+        cmocka_unit_test(damaged_pixels_of_a_tiff_are_named_by_their_place),
         cmocka_unit_test(no_damaged_byte_crashes_a_reader),
         cmocka_unit_test(what_is_no_picture_is_named),
         cmocka_unit_test(a_write_that_fails_leaves_the_old_file_and_nothing_else),
