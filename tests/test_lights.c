@@ -37,8 +37,7 @@ static void random_unit(double out[3], uint64_t stream, uint64_t i)
     vec3_normalise(out);
 }
 
-// ---- Eqs. 1-4
-// -----------------------------------------------------------------------------------------------------------
+// ---- Eqs. 1-4 -----------------------------------------------------------------------------------
 
 // n lights about a centre off the origin, turned; every fourth directional.
 static struct lights near_lights(int n)
@@ -225,8 +224,7 @@ static void behind_and_at_a_light_there_is_no_light(void **state)
     lights_free(&l);
 }
 
-// ---- median cut
-// ---------------------------------------------------------------------------------------------------------
+// ---- median cut ---------------------------------------------------------------------------------
 
 static struct panorama black(int height)
 {
@@ -373,6 +371,27 @@ static void lone_bright_pixels_on_black_get_one_light_each(void **state)
     panorama_free(&p);
 }
 
+static void a_lone_bright_pixel_is_found_in_log2_steps(void **state)
+{
+    (void)state;
+    struct panorama p = black(64);
+    struct lights l;
+    p.image.data[3 * (128 * 41 + 77)] = 1;
+    assert_int_equal(lights_median_cut(&l, &p, 128 * 64), 0);
+    assert_partition(&l);
+    int n_lit = 0;
+    for (int i = 0; i < l.n; i++) {
+        const struct light_region *r = &l.region[i];
+        if (l.irradiance[i][0] <= 0)
+            continue;
+        n_lit++;
+        assert_true(r->x0 == 77 && r->x1 == 78 && r->y0 == 41 && r->y1 == 42);
+    }
+    assert_int_equal(n_lit, 1);
+    lights_free(&l);
+    panorama_free(&p);
+}
+
 static void direction_and_spread_are_energy_weighted(void **state)
 {
     (void)state;
@@ -429,8 +448,32 @@ static void what_cannot_be_split_gives_empty_lights(void **state)
     panorama_free(&p);
 }
 
-// ---- lights.json
-// --------------------------------------------------------------------------------------------------------
+static void photographed_studios_keep_their_energy(void **state)
+{
+    (void)state;
+    static const char *const files[] = {"studio_small_03_1k.hdr", "brown_photostudio_02_1k.hdr",
+                                        "OrientationLatLong.exr"};
+    for (int f = 0; f < 3; f++) {
+        char path[256];
+        snprintf(path, sizeof(path), "../shared/data/hdri/%s", files[f]);
+        if (access(path, R_OK)) {
+            print_message("# %s is not there: not checked\n", path);
+            continue;
+        }
+        struct panorama p;
+        assert_int_equal(panorama_read(&p, path), 0);
+        for (int n = 16; n <= 4096; n *= 16) {
+            struct lights l;
+            assert_int_equal(lights_median_cut(&l, &p, n), 0);
+            assert_partition(&l);
+            assert_same_energy(&l, &p, 1e-12);
+            lights_free(&l);
+        }
+        panorama_free(&p);
+    }
+}
+
+// ---- lights.json --------------------------------------------------------------------------------
 
 static char folder[64]; // of this run, removed at the end
 
@@ -649,8 +692,7 @@ static void what_a_hand_may_write_is_read(void **state)
     lights_free(&l);
 }
 
-// ---- the path-traced studios
-// ------------------------------------------------------------------------------------------
+// ---- the path-traced studios --------------------------------------------------------------------
 
 static const char *const studios[] = {"../shared/data/studio-pebble", "../shared/data/studio-vase"};
 enum { N_STUDIOS = 2, MAX_PANELS = 16 };
@@ -995,8 +1037,10 @@ int main(void)
         cmocka_unit_test(regions_partition_the_panorama_and_keep_its_energy),
         cmocka_unit_test(every_region_is_halved_along_its_longer_side_at_the_best_place),
         cmocka_unit_test(lone_bright_pixels_on_black_get_one_light_each),
+        cmocka_unit_test(a_lone_bright_pixel_is_found_in_log2_steps),
         cmocka_unit_test(direction_and_spread_are_energy_weighted),
         cmocka_unit_test(what_cannot_be_split_gives_empty_lights),
+        cmocka_unit_test(photographed_studios_keep_their_energy),
         cmocka_unit_test(lights_survive_a_file_bit_for_bit),
         cmocka_unit_test(wrong_lights_are_refused_by_name),
         cmocka_unit_test(more_lights_than_the_limit_are_refused),

@@ -29,8 +29,7 @@ static void remember(void *arg, enum log_level level, const char *message)
         snprintf(last_warning, sizeof(last_warning), "%s", message);
 }
 
-// ---- directions and solid angles
-// ----------------------------------------------------------------------------------------
+// ---- directions and solid angles ----------------------------------------------------------------
 
 static void assert_direction(double x_px, double y_px, double x, double y, double z)
 {
@@ -151,8 +150,7 @@ static void a_lone_pixel_lights_by_its_cosine_and_not_from_behind(void **state)
     panorama_free(&p);
 }
 
-// ---- reading
-// ------------------------------------------------------------------------------------------------------------
+// ---- reading ------------------------------------------------------------------------------------
 
 static char folder[64];
 
@@ -262,6 +260,7 @@ static void negative_light_becomes_none_with_a_count(void **state)
     p.image.data[3 * 77 + 2] = -1e-3f;
     assert_int_equal(read_back(&back, &p.image), 0);
     assert_non_null(strstr(last_warning, "2 negative"));
+    assert_non_null(strstr(last_warning, "-0.25")); // the lowest
     assert_non_null(strstr(last_warning, "column 4, row 1")); // pixel 20 of 16 columns
     assert_true(back.image.data[3 * 20 + 1] == 0 && back.image.data[3 * 77 + 2] == 0);
     assert_true(back.image.data[3 * 20] == 1);
@@ -307,8 +306,7 @@ static void what_is_no_panorama_is_refused_with_its_reason(void **state)
     assert_int_equal(panorama_read(&back, "nowhere/p.exr"), -ENOENT);
 }
 
-// ---- OpenEXR's own picture of the convention
-// ----------------------------------------------------------------------------
+// ---- OpenEXR's own picture of the convention ----------------------------------------------------
 //
 // OrientationLatLong.exr shows the six faces of a cube. On each face two black lines leave the
 // middle along the positive directions of the other two axes, to .35 of the half width; behind
