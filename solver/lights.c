@@ -531,12 +531,15 @@ static int read_light(struct lights *l, int i, const struct json *doc, const cha
 
 static int from_json(struct lights *out, const struct json *doc, const char *file)
 {
+    struct lights l = {0};
     const char *format;
     int err = json_require_string(doc, "format", &format, file);
     if (err)
-        return err;
-    if (strcmp(format, format_name))
-        return refuse(file, "format", "is not \"studiorig-lights-1\"");
+        goto fail;
+    if (strcmp(format, format_name)) {
+        err = refuse(file, "format", "is not \"studiorig-lights-1\"");
+        goto fail;
+    }
     const int n = json_length(doc, "lights");
     if (n < 1 || n > LIGHTS_MAX) {
         log_error("lights: %s: lights: expected a list of 1 to %d lights, found %s", file,
@@ -544,22 +547,19 @@ static int from_json(struct lights *out, const struct json *doc, const char *fil
                   n > 0    ? "more"
                   : n == 0 ? "none"
                            : "no list");
-        return -EINVAL;
-    }
-    struct lights l;
-    err = lights_new(&l, n);
-    if (err)
-        return err;
-    if (json_get(doc, "lights.0.region"))
-        l.region = calloc((size_t)n, sizeof(*l.region));
-    if (json_get(doc, "lights.0.spread_rad"))
-        l.spread_rad = calloc((size_t)n, sizeof(*l.spread_rad));
-    if ((json_get(doc, "lights.0.region") && !l.region) ||
-        (json_get(doc, "lights.0.spread_rad") && !l.spread_rad)) {
-        err = -ENOMEM;
+        err = -EINVAL;
         goto fail;
     }
-    err = read_place(&l, doc, file);
+    err = lights_new(&l, n);
+    if (err)
+        goto fail;
+    const bool regions = json_get(doc, "lights.0.region"),
+               spreads = json_get(doc, "lights.0.spread_rad");
+    l.region = regions ? calloc((size_t)n, sizeof(*l.region)) : NULL;
+    l.spread_rad = spreads ? calloc((size_t)n, sizeof(*l.spread_rad)) : NULL;
+    err = (regions && !l.region) || (spreads && !l.spread_rad) ? -ENOMEM : 0;
+    if (!err)
+        err = read_place(&l, doc, file);
     if (!err)
         err = read_panorama_size(&l, doc, file);
     for (int i = 0; i < n && !err; i++)
@@ -570,7 +570,8 @@ static int from_json(struct lights *out, const struct json *doc, const char *fil
     return 0;
 fail:
     lights_free(&l);
-    return err;
+    return err == -ENOENT ? -EINVAL
+                          : err; // a missing key is a broken file; -ENOENT says there is none
 }
 
 int lights_parse_json(struct lights *out, const char *text, size_t n_bytes,

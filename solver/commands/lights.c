@@ -356,7 +356,7 @@ int command_lights(int argc, char **argv)
     summarise(&s, &p, &l);
     if (s.plateau_px > PLATEAU_PX)
         log_warning(
-            "lights: %s: %d pixels in a row at exactly the highest value (from %d,%d): if this "
+            "lights: %s: %d pixels in a row at exactly the highest value (from column %d, row %d): if this "
             "is a photograph, its lamps are clipped and too dark: add a shorter exposure",
             a.panorama, s.plateau_px, s.plateau_x, s.plateau_y);
     err = lights_write_json(&l, a.output);

@@ -67,8 +67,8 @@ int image_check_size(const struct image_file *file, int64_t width, int64_t heigh
     }
     const uint64_t asked = (uint64_t)(width * height) * (uint64_t)stored_bytes;
     if (asked > file->n_bytes * MAX_RATIO + FREE_BYTES) {
-        log_error("image: %s: the header asks for %llu bytes of pixels, which a file of %zu bytes cannot hold",
-                  file->name, (unsigned long long)asked, file->n_bytes);
+        log_error("image: %s: the header asks for %lld x %lld pixels (%llu bytes), which a file of %zu bytes cannot hold",
+                  file->name, (long long)width, (long long)height, (unsigned long long)asked, file->n_bytes);
         return -EFBIG;
     }
     return 0;

@@ -140,9 +140,9 @@ void log_line(enum log_level level, const char *format, ...)
         }
         if (out && fclose(out) == 0)
             write_stderr(line, n_line);
-        if (hook_function)
-            hook_function(hook_arg, level, text);
     }
+    if (hook_function)
+        hook_function(hook_arg, level, text);
     pthread_mutex_unlock(&lock);
     free(line);
     free(message);
