@@ -280,7 +280,8 @@ static int load_lights(struct scene *scene, const struct settings *s)
 {
     if (!s->panorama && !s->lights)
         return 0;
-    int err = s->panorama ? panorama_read(&scene->panorama, s->panorama) : 0;
+    const bool needs_pixels = !s->lights || s->n_sub > 1;
+    int err = needs_pixels && s->panorama ? panorama_read(&scene->panorama, s->panorama) : 0;
     if (err)
         return err;
     struct lights *l = &scene->lights;
