@@ -108,7 +108,7 @@ static bool find_constants(struct constants *k, struct material_terms *t, const 
     k->a0 = -(iax * ax_an + iay * ay_an) - gv / root * (vx2 * k->ga_x + vy2 * k->ga_y);
     k->scale_gd = gv * iax * iay * (float)M_1_PI;
 
-    const float a = .1f - .099f * theta[DISNEY_CLEARCOAT_GLOSS], a2 = a * a, log_a2 = logf(a2);
+    const float a = .001f + .099f * (1 - theta[DISNEY_CLEARCOAT_GLOSS]), a2 = a * a, log_a2 = logf(a2);
     const float coat_root = sqrtf(.0625f + .9375f * k->nv * k->nv);
     k->a2 = a2;
     k->scale_coat = .25f * (a2 - 1) / ((float)M_PI * log_a2 * (k->nv + coat_root));
