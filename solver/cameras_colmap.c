@@ -125,7 +125,8 @@ static int compare_intrinsics(const void *a, const void *b)
 
 static int sort_intrinsics(struct intrinsics *all, int n, const char *file)
 {
-    qsort(all, (size_t)n, sizeof(*all), compare_intrinsics);
+    if (n > 0)
+        qsort(all, (size_t)n, sizeof(*all), compare_intrinsics);
     for (int i = 1; i < n; i++)
         if (all[i - 1].id == all[i].id) {
             log_error("cameras: %s: two cameras have the id %" PRIu32 "; ids must differ", file, all[i].id);

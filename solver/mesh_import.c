@@ -19,6 +19,8 @@
 #include <stdarg.h>
 #include <stdlib.h>
 #include <string.h>
+#include <sys/stat.h>
+#include <unistd.h>
 
 enum { MAX_TRIANGLES = 1 << 26, GLTF_MAX_DEPTH = 256 };
 static const size_t max_file_bytes = (size_t)8 << 30;
@@ -158,7 +160,7 @@ static int check_obj_face(struct obj *o, const char *at, const char *end)
     return 0;
 }
 
-static int check_obj(const struct mesh_file *f)
+static int check_obj(struct mesh_file *f)
 {
     struct obj o = { .file = f };
     const char *at = f->bytes, *end = f->bytes + f->n_bytes;
@@ -197,6 +199,21 @@ static int check_obj(const struct mesh_file *f)
         log_warning("mesh: %s: no face uses the last %" PRId64 " of %" PRId64 " vertices: was the file cut short?", f->path,
                     o.n[0] - o.highest[0], o.n[0]);
     return 0;
+}
+
+// assimp takes ".5" for no number: the same text with "0.5" in such places, malloc'd. NULL without memory.
+static char *obj_with_leading_zeros(const struct mesh_file *f, size_t *n_bytes)
+{
+    char *out = malloc(f->n_bytes + f->n_bytes / 3 + 1); // " .5": one more for every three, at most
+    size_t n = 0;
+    for (size_t i = 0; i < f->n_bytes && out; i++) {
+        const char *c = f->bytes + i; // c[1] is there: a NUL ends the bytes
+        if (*c == '.' && i > 0 && is_blank(c[-1]) && c[1] >= '0' && c[1] <= '9')
+            out[n++] = '0';
+        out[n++] = *c;
+    }
+    *n_bytes = n;
+    return out;
 }
 
 // ---- PLY ----------------------------------------------------------------------------------------------------------------
@@ -376,7 +393,7 @@ cut_short:
                   " announced: the file is cut short or broken", p->at - p->file->bytes, e->name, i + 1, e->count);
 }
 
-static int check_ply(const struct mesh_file *f)
+static int check_ply(struct mesh_file *f)
 {
     struct ply *p = calloc(1, sizeof(*p));
     if (!p)
@@ -508,10 +525,28 @@ static int check_gltf_attribute(const struct mesh_file *f, const struct json *do
     return strcmp(found, type) ? refuse(f, -EINVAL, "%s: %s is %s; expected %s", primitive, name, found, type) : 0;
 }
 
-static int check_gltf_meshes(const struct mesh_file *f, const struct json *doc)
+// How many triangles a primitive promises.
+static int64_t gltf_triangles(const struct json *doc, const char *primitive)
 {
+    char path[192];
+    int64_t mode = 4, accessor = -1;
+    snprintf(path, sizeof(path), "%s.mode", primitive);
+    if (json_get(doc, path) && json_get_int(doc, path, &mode))
+        return 0;
+    snprintf(path, sizeof(path), "%s.indices", primitive);
+    if (!json_get(doc, path))
+        snprintf(path, sizeof(path), "%s.attributes.POSITION", primitive);
+    if (json_get_int(doc, path, &accessor) || accessor < 0)
+        return 0;
+    const int64_t n = gltf_int(doc, "accessors", accessor, "count", 0, 1 << 28);
+    return mode == 4 ? n / 3 : (mode == 5 || mode == 6) && n > 2 ? n - 2 : 0;
+}
+
+static int check_gltf_meshes(struct mesh_file *f, const struct json *doc)
+{
+    f->n_promised = 0;
     for (int64_t i = 0; i < gltf_length(doc, "meshes"); i++) {
-        char path[160];
+        char path[96]; // far longer than two numbers need
         snprintf(path, sizeof(path), "meshes.%" PRId64 ".primitives", i);
         for (int64_t k = 0, n = gltf_length(doc, path); k < n; k++) {
             snprintf(path, sizeof(path), "meshes.%" PRId64 ".primitives.%" PRId64, i, k);
@@ -522,6 +557,7 @@ static int check_gltf_meshes(const struct mesh_file *f, const struct json *doc)
                 err = check_gltf_attribute(f, doc, path, "TEXCOORD_0", "VEC2", false);
             if (err)
                 return err;
+            f->n_promised += gltf_triangles(doc, path);
         }
     }
     return 0;
@@ -562,8 +598,62 @@ static int check_gltf_nodes(const struct mesh_file *f, const struct json *doc)
     return err;
 }
 
-// A buffer's own bytes are looked for by assimp (a file beside, base64 text), except a GLB's BIN chunk: n_bin.
-static int check_gltf_json(const struct mesh_file *f, const char *text, size_t n_text, int64_t n_bin)
+// %20 and the like, in place.
+static void percent_decode(char *s)
+{
+    char *out = s;
+    for (; *s; s++) {
+        unsigned value;
+        if (s[0] == '%' && s[1] && s[2] && sscanf(s + 1, "%2x", &value) == 1 && value) {
+            *out++ = (char)value;
+            s += 2;
+        } else {
+            *out++ = *s;
+        }
+    }
+    *out = 0;
+}
+
+// name in the folder of path, as it is or (where there is no such file) percent-decoded. NULL without memory.
+static char *path_beside(const char *path, const char *name)
+{
+    const char *slash = strrchr(path, '/');
+    char *full;
+    if (asprintf(&full, "%.*s%s", slash ? (int)(slash + 1 - path) : 0, path, name) < 0)
+        return NULL;
+    if (access(full, F_OK))
+        percent_decode(full + (slash ? slash + 1 - path : 0));
+    return full;
+}
+
+// A GLB's own chunk, base64 text (assimp counts that), or a file beside: long enough for what is promised?
+static int check_gltf_buffer(const struct mesh_file *f, const struct json *doc, int64_t i, int64_t n_bytes, int64_t n_bin)
+{
+    char path[64];
+    const char *uri;
+    struct stat st;
+    if (n_bytes < 0)
+        return refuse(f, -EINVAL, "buffer %" PRId64 ": byteLength is missing or out of range", i);
+    snprintf(path, sizeof(path), "buffers.%" PRId64 ".uri", i);
+    if (json_get_string(doc, path, &uri)) {
+        const int64_t n_there = i == 0 ? n_bin : 0;
+        return n_bytes <= n_there ? 0 : refuse(f, -EINVAL, "buffer %" PRId64 " has %" PRId64 " bytes, the BIN chunk %" PRId64
+                                               ": the file is cut short or broken", i, n_bytes, n_there);
+    }
+    if (!strncmp(uri, "data:", 5))
+        return 0;
+    char *full = path_beside(f->path, uri);
+    int err = full ? 0 : -ENOMEM;
+    if (full && stat(full, &st))
+        err = refuse(f, -EINVAL, "buffer %" PRId64 " is the file '%s': %s", i, full, strerror(errno));
+    else if (full && st.st_size < n_bytes)
+        err = refuse(f, -EINVAL, "buffer %" PRId64 " is the file '%s' of %" PRId64 " bytes; expected %" PRId64
+                     ": it is cut short", i, full, (int64_t)st.st_size, n_bytes);
+    free(full);
+    return err;
+}
+
+static int check_gltf_json(struct mesh_file *f, const char *text, size_t n_text, int64_t n_bin)
 {
     struct json *doc;
     int err = json_parse(&doc, text, n_text, f->path);
@@ -571,15 +661,13 @@ static int check_gltf_json(const struct mesh_file *f, const char *text, size_t n
         return err;
     err = check_gltf_extensions(f, doc);
     const int64_t n_buffers = gltf_length(doc, "buffers");
+    int64_t n_total = 0;
     for (int64_t i = 0; i < n_buffers && !err; i++) {
-        char path[64];
         const int64_t n_bytes = gltf_int(doc, "buffers", i, "byteLength", -1, INT64_C(1) << 40);
-        snprintf(path, sizeof(path), "buffers.%" PRId64 ".uri", i);
-        if (n_bytes < 0)
-            err = refuse(f, -EINVAL, "buffer %" PRId64 ": byteLength is missing or out of range", i);
-        else if (!json_get(doc, path) && (i > 0 || n_bytes > n_bin))
-            err = refuse(f, -EINVAL, "buffer %" PRId64 " has %" PRId64 " bytes, the BIN chunk %" PRId64 ": the file is cut short "
-                         "or broken", i, n_bytes, i > 0 ? 0 : n_bin);
+        err = check_gltf_buffer(f, doc, i, n_bytes, n_bin);
+        n_total += n_bytes; // many buffers may name one file
+        if (!err && n_total > (int64_t)max_file_bytes)
+            err = refuse(f, -EFBIG, "buffers of more than %zu bytes", max_file_bytes);
     }
     for (int64_t i = 0; i < gltf_length(doc, "bufferViews") && !err; i++) {
         const int64_t buffer = gltf_int(doc, "bufferViews", i, "buffer", -1, n_buffers - 1);
@@ -600,12 +688,12 @@ static int check_gltf_json(const struct mesh_file *f, const char *text, size_t n
     return err;
 }
 
-static int check_gltf(const struct mesh_file *f)
+static int check_gltf(struct mesh_file *f)
 {
     return check_gltf_json(f, f->bytes, f->n_bytes, 0);
 }
 
-static int check_glb(const struct mesh_file *f)
+static int check_glb(struct mesh_file *f)
 {
     static const uint32_t json_chunk = 0x4e4f534a, bin_chunk = 0x004e4942;
     if (f->n_bytes < 20)
@@ -679,21 +767,23 @@ static bool is_obj(const struct mesh_file *f)
 static const struct {
     const char *alias; // the name assimp gets to see
     bool (*probe)(const struct mesh_file *f);
-    int (*check)(const struct mesh_file *f);
-    bool has_buffers; // may open files beside it
+    int (*check)(struct mesh_file *f);
+    char *(*rewrite)(const struct mesh_file *f, size_t *n_bytes); // NULL: assimp takes the bytes as they are
+    bool has_buffers;                                             // may open files beside it
 } formats[] = {
-    { "mesh.glb", is_glb, check_glb, true },
-    { "mesh.ply", is_ply, check_ply, false },
-    { "mesh.gltf", is_gltf, check_gltf, true },
-    { "mesh.obj", is_obj, check_obj, false },
+    { "mesh.glb", is_glb, check_glb, NULL, true },
+    { "mesh.ply", is_ply, check_ply, NULL, false },
+    { "mesh.gltf", is_gltf, check_gltf, NULL, true },
+    { "mesh.obj", is_obj, check_obj, obj_with_leading_zeros, false },
 };
 enum { N_FORMATS = sizeof(formats) / sizeof(formats[0]) };
 
-int mesh_check_file(const struct mesh_file *f, int *format)
+int mesh_check_file(struct mesh_file *f, int *format)
 {
     for (int i = 0; i < N_FORMATS; i++)
         if (formats[i].probe(f)) {
             *format = i;
+            f->n_promised = -1;
             return formats[i].check(f);
         }
     return refuse(f, f->n_bytes ? -ENOTSUP : -EINVAL, f->n_bytes ? "not a known mesh format; expected OBJ, PLY, glTF or GLB"
@@ -703,9 +793,11 @@ int mesh_check_file(const struct mesh_file *f, int *format)
 // ---- assimp -------------------------------------------------------------------------------------------------------------
 
 struct opened { // a file that assimp has open
+    struct aiFile file;
     char *owned;
     const char *bytes;
     size_t n_bytes, at;
+    struct opened *next;
 };
 
 static size_t read_bytes(struct aiFile *file, char *out, size_t size, size_t count)
@@ -753,64 +845,40 @@ static void flush_nothing(struct aiFile *file)
 struct importing {
     const struct mesh_file *file;
     int format;
+    struct opened *all; // assimp forgets to close files when it gives up
 };
-
-// %20 and the like, in place.
-static void percent_decode(char *s)
-{
-    char *out = s;
-    for (; *s; s++) {
-        unsigned value;
-        if (s[0] == '%' && sscanf(s + 1, "%2x", &value) == 1 && s[1] && s[2] && value) {
-            *out++ = (char)value;
-            s += 2;
-        } else {
-            *out++ = *s;
-        }
-    }
-    *out = 0;
-}
 
 static int read_beside(struct opened *o, const char *path, const char *name)
 {
-    const char *slash = strrchr(path, '/');
-    char *full;
-    if (asprintf(&full, "%.*s%s", slash ? (int)(slash + 1 - path) : 0, path, name) < 0)
-        return -ENOMEM;
-    int err = whole_file_read(&o->owned, &o->n_bytes, full, max_file_bytes);
-    if (err == -ENOENT && strchr(name, '%')) {
-        percent_decode(full);
-        err = whole_file_read(&o->owned, &o->n_bytes, full, max_file_bytes);
-    }
+    char *full = path_beside(path, name);
+    const int err = full ? whole_file_read(&o->owned, &o->n_bytes, full, max_file_bytes) : -ENOMEM;
     if (err)
-        log_error("mesh: %s: cannot read its buffer %s: %s", path, full, strerror(-err));
+        log_error("mesh: %s: cannot read its buffer %s: %s", path, name, strerror(-err));
     free(full);
     return err;
 }
 
 static struct aiFile *open_file(struct aiFileIO *io, const char *name, const char *mode)
 {
-    const struct importing *im = (const struct importing *)io->UserData;
+    struct importing *im = (struct importing *)io->UserData;
     (void)mode;
-    struct aiFile *file = calloc(1, sizeof(*file));
     struct opened *o = calloc(1, sizeof(*o));
-    if (!file || !o)
-        goto fail;
+    if (!o)
+        return NULL;
     while (!strncmp(name, "./", 2))
         name += 2;
     if (!strcmp(name, formats[im->format].alias)) {
         o->bytes = im->file->bytes, o->n_bytes = im->file->n_bytes;
-    } else {
-        if (!formats[im->format].has_buffers || read_beside(o, im->file->path, name))
-            goto fail;
+    } else if (formats[im->format].has_buffers && !read_beside(o, im->file->path, name)) {
         o->bytes = o->owned;
+    } else {
+        free(o);
+        return NULL;
     }
-    *file = (struct aiFile){ read_bytes, write_nothing, tell, file_size, seek, flush_nothing, (char *)o };
-    return file;
-fail:
-    free(file);
-    free(o);
-    return NULL;
+    o->file = (struct aiFile){ read_bytes, write_nothing, tell, file_size, seek, flush_nothing, (char *)o };
+    o->next = im->all;
+    im->all = o;
+    return &o->file;
 }
 
 static void close_file(struct aiFileIO *io, struct aiFile *file)
@@ -818,8 +886,18 @@ static void close_file(struct aiFileIO *io, struct aiFile *file)
     (void)io;
     struct opened *o = (struct opened *)file->UserData;
     free(o->owned);
-    free(o);
-    free(file);
+    o->owned = NULL;
+    o->n_bytes = o->at = 0;
+}
+
+static void forget_files(struct importing *im)
+{
+    while (im->all) {
+        struct opened *o = im->all;
+        im->all = o->next;
+        free(o->owned);
+        free(o);
+    }
 }
 
 // What the scene's meshes become, before vertices are told apart.
@@ -949,6 +1027,18 @@ static int count_mesh(void *arg, const struct aiMesh *mesh, const double world[1
     return t->n_triangles > MAX_TRIANGLES || t->n_vertices > 3 * (int64_t)MAX_TRIANGLES ? -EFBIG : 0;
 }
 
+// assimp leaves out faces whose indices are out of range, without a word.
+static int check_promise(const struct mesh_file *f, const struct aiScene *scene)
+{
+    int64_t n = 0;
+    for (unsigned i = 0; i < scene->mNumMeshes; i++)
+        for (unsigned k = 0; k < scene->mMeshes[i]->mNumFaces; k++)
+            n += scene->mMeshes[i]->mFaces[k].mNumIndices == 3;
+    return f->n_promised < 0 || n == f->n_promised ? 0
+           : refuse(f, -EINVAL, "%" PRId64 " of %" PRId64 " triangles use vertices that do not exist", f->n_promised - n,
+                    f->n_promised);
+}
+
 struct adding {
     struct soup *soup;
     const struct mesh_file *file;
@@ -963,16 +1053,26 @@ static int add_visited(void *arg, const struct aiMesh *mesh, const double world[
 static int import(struct soup *s, const struct mesh_file *f, int format)
 {
     int err;
-    struct importing im = { f, format };
+    struct mesh_file shown = *f;
+    struct importing im = { &shown, format, NULL };
     struct aiFileIO io = { open_file, close_file, (char *)&im };
     struct totals totals = { 0, 0 };
     struct adding adding = { s, f };
+    char *rewritten = NULL;
+    if (formats[format].rewrite) {
+        rewritten = formats[format].rewrite(f, &shown.n_bytes);
+        if (!rewritten)
+            return -ENOMEM;
+        shown.bytes = rewritten;
+    }
     const struct aiScene *scene = aiImportFileEx(formats[format].alias, aiProcess_Triangulate, &io);
     if (!scene || !scene->mRootNode || (scene->mFlags & AI_SCENE_FLAGS_INCOMPLETE && !scene->mNumMeshes)) {
         err = refuse(f, -EINVAL, "%s", scene ? "no triangles" : aiGetErrorString());
         goto done;
     }
-    err = walk_nodes(scene, count_mesh, &totals);
+    err = check_promise(f, scene);
+    if (!err)
+        err = walk_nodes(scene, count_mesh, &totals);
     if (err == -EFBIG) {
         refuse(f, err, "more than %d triangles; reduce the mesh", MAX_TRIANGLES);
         goto done;
@@ -991,6 +1091,8 @@ static int import(struct soup *s, const struct mesh_file *f, int format)
                      s->n_triangles);
 done:
     aiReleaseImport(scene);
+    forget_files(&im);
+    free(rewritten);
     return err;
 }
 

@@ -295,6 +295,11 @@ static int check_regions(const struct lights *l, const struct panorama *p)
         log_error("visibility: soft visibility needs lights cut from a panorama, and that panorama");
         return -EINVAL;
     }
+    if (l->panorama_width_px != p->image.width || l->panorama_height_px != p->image.height) {
+        log_error("visibility: the lights were cut from a panorama of %d x %d, this one has %d x %d: cut them from this one",
+                  l->panorama_width_px, l->panorama_height_px, p->image.width, p->image.height);
+        return -EINVAL;
+    }
     for (int i = 0; i < l->n; i++) {
         const struct light_region *g = &l->region[i];
         if (g->x0 < 0 || g->y0 < 0 || g->x0 > g->x1 || g->y0 > g->y1 || g->x1 > p->image.width ||

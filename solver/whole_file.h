@@ -11,6 +11,7 @@ static inline int whole_file_read(char **bytes, size_t *n_bytes, const char *pat
 {
     int err = 0;
     char *data = NULL;
+    *bytes = NULL, *n_bytes = 0;
     struct stat st;
     FILE *f = fopen(path, "rbe");
     if (!f)

@@ -611,16 +611,20 @@ static void soft_without_what_it_needs_is_refused_with_one_line(void **state)
 {
     (void)state;
     struct scene s = scene_of(ray_mesh_sphere(12, 6), 16);
-    struct panorama p = noisy_panorama(), small = panorama_with(32, 0, 0, 32, 16);
-    struct lights l, loose = random_lights(4, 1);
+    struct panorama p = noisy_panorama(), small = panorama_with(32, 0, 0, 32, 16),
+                    large = panorama_with(128, 0, 0, 128, 64);
+    struct lights l, torn, loose = random_lights(4, 1);
     assert_int_equal(lights_median_cut(&l, &p, 16), 0);
+    assert_int_equal(lights_median_cut(&torn, &p, 16), 0);
+    torn.region[5].x1 = 65; // one pixel beyond the panorama
     const struct {
         const struct lights *lights;
         const struct panorama *panorama;
         int n_sub;
     } bad[] = { { &l, &p, 0 },   { &l, &p, 2 },     { &l, &p, 17 },
-                { &l, NULL, 4 }, { &loose, &p, 4 }, { &l, &small, 4 } };
-    for (int i = 0; i < 6; i++) {
+                { &l, NULL, 4 }, { &loose, &p, 4 }, { &l, &small, 4 },
+                { &l, &large, 4 }, { &torn, &p, 4 } };
+    for (size_t i = 0; i < sizeof(bad) / sizeof(bad[0]); i++) {
         int n_lines = 0;
         struct light_visibility v;
         memset(&v, 1, sizeof(v));
@@ -634,7 +638,9 @@ static void soft_without_what_it_needs_is_refused_with_one_line(void **state)
         light_visibility_free(&v);
     }
     lights_free(&loose);
+    lights_free(&torn);
     lights_free(&l);
+    panorama_free(&large);
     panorama_free(&small);
     panorama_free(&p);
     scene_free(&s);

@@ -280,7 +280,8 @@ static int load_lights(struct scene *scene, const struct settings *s)
 {
     if (!s->panorama && !s->lights)
         return 0;
-    int err = s->panorama ? panorama_read(&scene->panorama, s->panorama) : 0;
+    const bool needs_pixels = !s->lights || s->n_sub > 1;
+    int err = needs_pixels && s->panorama ? panorama_read(&scene->panorama, s->panorama) : 0;
     if (err)
         return err;
     struct lights *l = &scene->lights;
@@ -505,7 +506,7 @@ static int compare_floats(const void *a, const void *b)
     return (x > y) - (x < y);
 }
 
-// So that the subject's 98th percentile comes out just below white.
+// So that the subject's 98th percentile (of the first channel) comes out just below white.
 static double exposure_for(const struct image *image, const uint8_t *hit)
 {
     const size_t n_pixels = (size_t)image->width * (size_t)image->height;
@@ -528,12 +529,12 @@ static bool is_hit(const uint8_t *hit, int width, int height, int x, int y)
     return x >= 0 && y >= 0 && x < width && y < height && hit[y * width + x];
 }
 
-// The picture, small ones magnified, with a line along the edge between hit and missed pixels: on the missed ones' side, so that no
+// The picture, a small one magnified, with a line along the edge between hit and missed pixels: on the missed ones' side, so that no
 // pixel of the subject is painted over.
 static int draw_outline(const struct image *image, const uint8_t *hit, const char *path)
 {
     const int width = image->width, height = image->height;
-    const int scale = width <= 480 ? 4 : width <= 960 ? 2 : 1;
+    const int scale = width <= 960 ? 2 : 1;
     const double exposure_ev = exposure_for(image, hit);
     const float on = (float)exp2(-exposure_ev);
     struct image out;

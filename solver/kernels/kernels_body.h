@@ -16,7 +16,7 @@
 // parts are added; above, the first part is enough.
 //
 // 27 sums per sample carry everything (SOLVER.md 6): Fd, ss, FH, GD(1-FH), GD FH, coat, by roughness, by anisotropic, by gloss,
-// each x RGB. Sums are taken in blocks of BLOCK lights in float and added up in double, so that thousands of lights cost no digits.
+// each x RGB. Sums are taken per block of BLOCK lights, then over the blocks, so that thousands of lights cost no digits.
 #include "solver/kernels/kernels.h"
 
 #include <math.h>
@@ -246,7 +246,7 @@ INLINE void jacobian_light(vf sum[N_SUMS][3], const struct constants *k, const s
     }
 }
 
-static void finish(struct shade_jacobian *out, double sums[N_SUMS][3], const struct constants *k,
+static void finish(struct shade_jacobian *out, float sums[N_SUMS][3], const struct constants *k,
                    const struct material_terms *t, const struct shade_material *m)
 {
     const float *theta = m->theta, weight[3] = { .3f, .6f, .1f };
@@ -255,10 +255,10 @@ static void finish(struct shade_jacobian *out, double sums[N_SUMS][3], const str
     const float sheen = theta[DISNEY_SHEEN], sheen_tint = theta[DISNEY_SHEEN_TINT];
     const float clearcoat = theta[DISNEY_CLEARCOAT], ilum = t->lum > 0 ? 1 / t->lum : 0;
     for (int c = 0; c < 3; c++) {
-        const float fd = (float)sums[FD][c] * (float)M_1_PI, ss = (float)sums[SS][c] * (float)M_1_PI;
-        const float fh = (float)sums[FH][c];
-        const float gdn = k->scale_gd * (float)sums[GDN][c], gdf = k->scale_gd * (float)sums[GDF][c];
-        const float coat = k->scale_coat * (float)sums[COAT][c], gloss = k->scale_coat * (float)sums[BY_GLOSS][c];
+        const float fd = sums[FD][c] * (float)M_1_PI, ss = sums[SS][c] * (float)M_1_PI;
+        const float fh = sums[FH][c];
+        const float gdn = k->scale_gd * sums[GDN][c], gdf = k->scale_gd * sums[GDF][c];
+        const float coat = k->scale_coat * sums[COAT][c], gloss = k->scale_coat * sums[BY_GLOSS][c];
         const float base = fd + theta[DISNEY_SUBSURFACE] * (ss - fd), albedo = m->albedo[c], tint = t->tint[c];
         const float diffuse = albedo * base + fh * sheen * t->sheen_colour[c];
         out->L[c] = dielectric * diffuse + k->f0[c] * gdn + gdf + clearcoat * coat;
@@ -266,9 +266,9 @@ static void finish(struct shade_jacobian *out, double sums[N_SUMS][3], const str
         d[DISNEY_METALLIC] = gdn * (albedo - t->f0_dielectric[c]) - diffuse;
         d[DISNEY_SUBSURFACE] = dielectric * albedo * (ss - fd);
         d[DISNEY_SPECULAR] = dielectric * gdn * t->specular_colour[c];
-        d[DISNEY_ROUGHNESS] = k->scale_gd * (float)sums[BY_ROUGHNESS][c];
+        d[DISNEY_ROUGHNESS] = k->scale_gd * sums[BY_ROUGHNESS][c];
         d[DISNEY_SPECULAR_TINT] = dielectric * gdn * .08f * specular * (tint - 1);
-        d[DISNEY_ANISOTROPIC] = k->scale_gd * (float)sums[BY_ANISOTROPIC][c];
+        d[DISNEY_ANISOTROPIC] = k->scale_gd * sums[BY_ANISOTROPIC][c];
         d[DISNEY_SHEEN] = dielectric * fh * t->sheen_colour[c];
         d[DISNEY_SHEEN_TINT] = dielectric * fh * sheen * (tint - 1);
         d[DISNEY_CLEARCOAT] = coat;
@@ -295,7 +295,7 @@ INLINE void load_lit(struct light_vector *l, const struct lit *lit, int i, bool 
         l->lx_rest = v_load(lit->lx_rest + i), l->ly_rest = v_load(lit->ly_rest + i);
 }
 
-INLINE void jacobian_all(double sums[N_SUMS][3], const struct lit *lit, const struct constants *k, bool sharp)
+INLINE void jacobian_all(float sums[N_SUMS][3], const struct lit *lit, const struct constants *k, bool sharp)
 {
     for (int begin = 0; begin < lit->n; begin += BLOCK) {
         const int end = lit->n - begin < BLOCK ? lit->n : begin + BLOCK;
@@ -318,7 +318,7 @@ static void shade_jacobian(struct shade_jacobian *out, const struct lit *lit, co
     *out = (struct shade_jacobian){ 0 };
     if (!find_constants(&k, &t, s, v, m))
         return;
-    double sums[N_SUMS][3] = { 0 };
+    float sums[N_SUMS][3] = { 0 };
     if (k.sharp)
         jacobian_all(sums, lit, &k, true);
     else
@@ -326,7 +326,7 @@ static void shade_jacobian(struct shade_jacobian *out, const struct lit *lit, co
     finish(out, sums, &k, &t, m);
 }
 
-INLINE void shade_all(double L[3], const struct lit *lit, const struct constants *k, bool sharp, const float base[3],
+INLINE void shade_all(float L[3], const struct lit *lit, const struct constants *k, bool sharp, const float base[3],
                       const float sheen[3], bool subsurface, bool coat)
 {
     for (int begin = 0; begin < lit->n; begin += BLOCK) {
@@ -357,7 +357,7 @@ static void shade(float L[3], const struct lit *lit, const struct surface_point 
     }
     k.scale_coat *= m->theta[DISNEY_CLEARCOAT];
     const bool subsurface = m->theta[DISNEY_SUBSURFACE] > 0 && dielectric > 0, coat = m->theta[DISNEY_CLEARCOAT] > 0;
-    double sums[3] = { 0 };
+    float sums[3] = { 0 };
     if (k.sharp)
         shade_all(sums, lit, &k, true, base, sheen, true, true);
     else if (subsurface && coat)
@@ -369,7 +369,7 @@ static void shade(float L[3], const struct lit *lit, const struct surface_point 
     else
         shade_all(sums, lit, &k, false, base, sheen, false, false);
     for (int c = 0; c < 3; c++)
-        L[c] = (float)sums[c];
+        L[c] = sums[c];
 }
 
 // Eqs. 1-4 for LANES lights: direction in the surface's frame and nl max(<u,d>,0)/|u|^3, with u = d + q (centre - p).
@@ -472,7 +472,7 @@ static void gather(struct lit *out, const struct light_arrays *a, const struct s
     }
 }
 
-INLINE void brute_all(double sums[N_SUMS][3], const struct light_arrays *a, const struct surface_point *s,
+INLINE void brute_all(float sums[N_SUMS][3], const struct light_arrays *a, const struct surface_point *s,
                       const struct constants *k, bool sharp)
 {
     for (int begin = 0; begin < a->n_padded; begin += BLOCK) {
@@ -501,7 +501,7 @@ static void brute_jacobian(struct shade_jacobian *out, const struct light_arrays
     *out = (struct shade_jacobian){ 0 };
     if (!find_constants(&k, &t, s, v, m))
         return;
-    double sums[N_SUMS][3] = { 0 };
+    float sums[N_SUMS][3] = { 0 };
     if (k.sharp)
         brute_all(sums, a, s, &k, true);
     else
@@ -512,7 +512,7 @@ static void brute_jacobian(struct shade_jacobian *out, const struct light_arrays
 static void irradiance(float E[3], const struct light_arrays *a, const struct surface_point *s,
                        const uint16_t *visible)
 {
-    double sums[3] = { 0 };
+    float sums[3] = { 0 };
     for (int begin = 0; begin < a->n_padded; begin += BLOCK) {
         const int end = a->n_padded - begin < BLOCK ? a->n_padded : begin + BLOCK;
         vf sum[3] = { v_set1(0), v_set1(0), v_set1(0) };
@@ -525,5 +525,5 @@ static void irradiance(float E[3], const struct light_arrays *a, const struct su
         add_up(sum, 3, sums);
     }
     for (int c = 0; c < 3; c++)
-        E[c] = (float)sums[c];
+        E[c] = sums[c];
 }

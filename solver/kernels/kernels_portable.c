@@ -101,10 +101,10 @@ V vf v_bytes(const uint8_t *p, int n)
 }
 
 // sums[0..n) += the lanes of x[0..n)
-V void add_up(const vf *x, int n, double *sums)
+V void add_up(const vf *x, int n, float *sums)
 {
     for (int i = 0; i < n; i++)
-        sums[i] += (double)((x[i][0] + x[i][1]) + (x[i][2] + x[i][3]));
+        sums[i] += (x[i][0] + x[i][1]) + (x[i][2] + x[i][3]);
 }
 
 #include "solver/kernels/kernels_body.h"

@@ -131,7 +131,8 @@ void atomic_file_abandon(struct atomic_file *f)
     *f = (struct atomic_file){ 0 };
 }
 
-// Some file systems cannot sync a folder and say so with EINVAL; the rename has happened all the same.
+// Some file systems cannot sync a folder and say so with EINVAL; the rename has happened all the
+// same.
 static int sync_folder(const char *path)
 {
     int err = 0;
@@ -242,8 +243,8 @@ int file_read(char **bytes, size_t *n_bytes, const char *path, size_t max_bytes)
     for (size_t allocated = 0;;) {
         if (room > max_bytes) {
             err = -EFBIG;
-            log_error("file: cannot read %s: larger than %zu bytes, the most that is read here", path,
-                      max_bytes);
+            log_error("file: cannot read %s: larger than %zu bytes, the most that is read here",
+                      path, max_bytes);
             goto fail;
         }
         if (allocated < room + 2) { // one byte to see the end, one for the NUL

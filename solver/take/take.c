@@ -55,7 +55,8 @@ static int compare_names(const void *a, const void *b)
     return strcmp(*(char *const *)a, *(char *const *)b);
 }
 
-// The names in dir, sorted bytewise so that nothing depends on the file system's order. 0 or -errno (logged).
+// The names in dir, sorted bytewise so that nothing depends on the file system's order. 0 or -errno
+// (logged).
 static int list_folder(const char *dir, char ***names, int *n_names)
 {
     struct dirent **entries = NULL;
@@ -114,7 +115,8 @@ static bool has_stem(const char *name, const char *stem)
     return dot && (size_t)(dot - name) == strlen(stem) && !strncmp(name, stem, strlen(stem));
 }
 
-// geometry/<stem>.<extension> (NULL: any); the first in bytewise order, with a warning for every other.
+// geometry/<stem>.<extension> (NULL: any); the first in bytewise order, with a warning for every
+// other.
 static int find_geometry(char **out, const char *dir, char *const *names, int n, const char *stem,
                          const char *const *extensions)
 {
@@ -210,8 +212,8 @@ static int look_at_views(struct take *take)
     qsort(views, (size_t)n_views, sizeof(*views), compare_names);
     for (int i = 1; i < n_views; i++)
         if (!strcmp(views[i - 1][0], views[i][0])) {
-            log_error("take: %s and %s have one name; a camera has one picture: remove one of them", views[i - 1][1],
-                      views[i][1]);
+            log_error("take: %s and %s have one name; a camera has one picture: remove one of them",
+                      views[i - 1][1], views[i][1]);
             err = -EINVAL;
             goto done;
         }
@@ -305,11 +307,15 @@ int take_require(const struct take *take, unsigned needs)
         { TAKE_MESH, take->mesh_path,
           "geometry/mesh.obj (or .ply, .glb, .gltf), which the photogrammetry tool exports" },
         { TAKE_CAMERAS, take->cameras_path,
-          "geometry/cameras (a COLMAP folder or a camera file), which the photogrammetry tool exports" },
-        { TAKE_PANORAMA, take->panorama_path, "panorama.exr, which `rigctl panorama` takes and develops" },
-        { TAKE_VIEWS, take->n_views > 0, "linear/<camera>.exr, which `rigctl develop` makes from the raw files" },
+          "geometry/cameras (a COLMAP folder or a camera file), which the photogrammetry tool "
+          "exports" },
+        { TAKE_PANORAMA, take->panorama_path,
+          "panorama.exr, which `rigctl panorama` takes and develops" },
+        { TAKE_VIEWS, take->n_views > 0,
+          "linear/<camera>.exr, which `rigctl develop` makes from the raw files" },
         { TAKE_START, take->start_path,
-          "start.json with a rough world_from_probe, which the operator gives (--world-from-probe)" },
+          "start.json with a rough world_from_probe, which the operator gives "
+          "(--world-from-probe)" },
     };
     int err = 0;
     for (size_t i = 0; i < sizeof(pieces) / sizeof(pieces[0]); i++)
