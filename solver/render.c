@@ -17,13 +17,26 @@
 #include <stdlib.h>
 #include <string.h>
 
-enum { MAX_GROUPS = 256, GROUP_LEVELS = 8, GUTTER_PX = 8, MAX_BOUNCE_RAYS = 4096, MAX_WORKERS = 256 };
+enum { MAX_GROUPS = 256, GROUP_LEVELS = 8, TILE = 1024, GUTTER_PX = 8, MAX_BOUNCE_RAYS = 4096, MAX_WORKERS = 256 };
 enum { BOUNCE_INDEX = 1 << 24, GROUP_INDEX_STEP = 1 << 12 }; // places in a sample's stream of random numbers
 
-// Lights [begin, end) with neighbouring directions; the boxes bound R dh and q of its members.
+// Bounds of R dh and q of some lights.
+struct light_box {
+    float low[3], high[3], q_low, q_high;
+};
+
+// Lights [begin, end) with neighbouring directions, whose shadows are judged together.
 struct light_group {
     int begin, end;
-    float low[3], high[3], q_low, q_high;
+    struct light_box box;
+};
+
+// TILE lights in a row, also neighbours: skipped together below the horizon, and few enough that what the kernels gather
+// stays in the cache.
+struct light_tile {
+    int begin;
+    struct light_arrays lights; // borrowed
+    struct light_box box;
 };
 
 struct renderer {
@@ -36,6 +49,8 @@ struct renderer {
     struct light_arrays lights; // in the order of the groups
     int n_groups;
     struct light_group group[MAX_GROUPS];
+    int n_tiles;
+    struct light_tile *tile;
     float *cumulative;          // [n] share of the group's energy up to and including this light
     struct image radiosity;     // outgoing diffuse radiance after the direct light; no pixels: no bounce
 };
@@ -67,7 +82,6 @@ static void scratch_free(struct scratch *s, int n)
 static struct scratch *scratch_new(const struct renderer *r, int n)
 {
     const int n_bounced = r->settings.bounce_rays > 0 ? r->settings.bounce_rays : 1;
-    const int n_lit = n_bounced > r->lights.n_padded ? n_bounced : r->lights.n_padded;
     struct lights bounced;
     if (lights_new(&bounced, n_bounced))
         return NULL;
@@ -75,7 +89,7 @@ static struct scratch *scratch_new(const struct renderer *r, int n)
     for (int i = 0; s && i < n; i++) {
         s[i].visible = calloc((size_t)r->lights.n_padded / 16, sizeof(*s[i].visible));
         s[i].share = calloc((size_t)r->lights.n_padded, sizeof(*s[i].share));
-        if (!s[i].visible || !s[i].share || lit_new(&s[i].lit, n_lit) || light_arrays_new(&s[i].bounced, &bounced)) {
+        if (!s[i].visible || !s[i].share || lit_new(&s[i].lit, n_bounced > TILE ? n_bounced : TILE) || light_arrays_new(&s[i].bounced, &bounced)) {
             scratch_free(s, n);
             s = NULL;
         }
@@ -225,8 +239,9 @@ static double luminance(const double rgb[3])
     return .2126 * rgb[0] + .7152 * rgb[1] + .0722 * rgb[2];
 }
 
-// Sort order[begin, end) along the longest side of its box of directions; the index where half of its energy is reached.
-static int split(const struct lights *l, int *order, struct sort_key *keys, int begin, int end)
+// Sort order[begin, end) along the longest side of its box of directions; the index where half of its energy (or of its
+// lights) is reached.
+static int split(const struct lights *l, int *order, struct sort_key *keys, int begin, int end, bool by_energy)
 {
     double low[3] = { INFINITY, INFINITY, INFINITY }, high[3] = { -INFINITY, -INFINITY, -INFINITY }, total = 0, sum = 0;
     for (int i = begin; i < end; i++) {
@@ -234,7 +249,7 @@ static int split(const struct lights *l, int *order, struct sort_key *keys, int 
             low[k] = fmin(low[k], l->dir_probe[order[i]][k]);
             high[k] = fmax(high[k], l->dir_probe[order[i]][k]);
         }
-        total += luminance(l->irradiance[order[i]]);
+        total += by_energy ? luminance(l->irradiance[order[i]]) : 1;
     }
     int axis = 0;
     for (int k = 1; k < 3; k++)
@@ -246,11 +261,21 @@ static int split(const struct lights *l, int *order, struct sort_key *keys, int 
     int middle = begin;
     for (int i = begin; i < end; i++) {
         order[i] = keys[i].index;
-        sum += luminance(l->irradiance[order[i]]);
+        sum += by_energy ? luminance(l->irradiance[order[i]]) : 1;
         if (sum <= total / 2)
             middle = i + 1;
     }
     return middle <= begin ? begin + 1 : middle >= end ? end - 1 : middle;
+}
+
+// Bring neighbours together down to a fraction of a tile.
+static void order_within(const struct lights *l, int *order, struct sort_key *keys, int begin, int end)
+{
+    if (end - begin <= TILE / 4)
+        return;
+    const int middle = split(l, order, keys, begin, end, false);
+    order_within(l, order, keys, begin, middle);
+    order_within(l, order, keys, middle, end);
 }
 
 // order[n]: the lights group by group. Groups have about equal energy.
@@ -265,11 +290,46 @@ static void partition_lights(struct renderer *r, const struct lights *l, int *or
             struct light_group *group = &r->group[g];
             if (group->end - group->begin < 2)
                 continue;
-            const int middle = split(l, order, keys, group->begin, group->end);
+            const int middle = split(l, order, keys, group->begin, group->end, true);
             r->group[r->n_groups++] = (struct light_group){ .begin = middle, .end = group->end };
             group->end = middle;
         }
     }
+    for (int g = 0; g < r->n_groups; g++)
+        order_within(l, order, keys, r->group[g].begin, r->group[g].end);
+}
+
+static struct light_box bound(const struct light_arrays *a, int begin, int end)
+{
+    struct light_box box = { { INFINITY, INFINITY, INFINITY }, { -INFINITY, -INFINITY, -INFINITY }, INFINITY, -INFINITY };
+    for (int i = begin; i < end; i++) {
+        const float d[3] = { a->dx[i], a->dy[i], a->dz[i] };
+        for (int k = 0; k < 3; k++)
+            box.low[k] = fminf(box.low[k], d[k]), box.high[k] = fmaxf(box.high[k], d[k]);
+        box.q_low = fminf(box.q_low, a->q[i]), box.q_high = fmaxf(box.q_high, a->q[i]);
+    }
+    return box;
+}
+
+static int make_tiles(struct renderer *r)
+{
+    const struct light_arrays *a = &r->lights;
+    r->n_tiles = (a->n + TILE - 1) / TILE;
+    r->tile = calloc((size_t)r->n_tiles, sizeof(*r->tile));
+    if (!r->tile)
+        return -ENOMEM;
+    for (int i = 0; i < r->n_tiles; i++) {
+        struct light_tile *t = &r->tile[i];
+        const int begin = i * TILE, n = a->n - begin < TILE ? a->n - begin : TILE;
+        const int n_padded = a->n_padded - begin < TILE ? a->n_padded - begin : TILE;
+        t->begin = begin;
+        t->lights = (struct light_arrays){ .n = n, .n_padded = n_padded,
+            .centre_m = { a->centre_m[0], a->centre_m[1], a->centre_m[2] },
+            .dx = a->dx + begin, .dy = a->dy + begin, .dz = a->dz + begin, .q = a->q + begin,
+            .cr = a->cr + begin, .cg = a->cg + begin, .cb = a->cb + begin };
+        t->box = bound(a, begin, begin + n);
+    }
+    return 0;
 }
 
 static int prepare_lights(struct renderer *r, const struct lights *l)
@@ -291,24 +351,19 @@ static int prepare_lights(struct renderer *r, const struct lights *l)
     }
     if (light_arrays_new(&r->lights, &sorted))
         goto done;
-    const struct light_arrays *a = &r->lights;
     for (int g = 0; g < r->n_groups; g++) {
         struct light_group *group = &r->group[g];
         double total = 0, sum = 0;
-        for (int k = 0; k < 3; k++)
-            group->low[k] = INFINITY, group->high[k] = -INFINITY;
-        group->q_low = INFINITY, group->q_high = -INFINITY;
+        group->box = bound(&r->lights, group->begin, group->end);
         for (int i = group->begin; i < group->end; i++)
             total += luminance(sorted.irradiance[i]);
         for (int i = group->begin; i < group->end; i++) {
-            const float d[3] = { a->dx[i], a->dy[i], a->dz[i] };
             sum += luminance(sorted.irradiance[i]);
             r->cumulative[i] = total > 0 ? (float)(sum / total) : 1;
-            for (int k = 0; k < 3; k++)
-                group->low[k] = fminf(group->low[k], d[k]), group->high[k] = fmaxf(group->high[k], d[k]);
-            group->q_low = fminf(group->q_low, a->q[i]), group->q_high = fmaxf(group->q_high, a->q[i]);
         }
     }
+    if (make_tiles(r))
+        goto done;
     err = 0;
 done:
     lights_free(&sorted);
@@ -355,15 +410,15 @@ static void trace_every_light(const struct renderer *r, const struct point *p, c
     }
 }
 
-// Largest possible <n, u> of a group's members: below 0 the whole group is under the horizon.
-static float highest_above_horizon(const struct renderer *r, const struct light_group *g, const struct point *p)
+// False only if every light in the box lies below the point's horizon: the largest possible <n, u>, less rounding, is below 0.
+static bool may_rise(const struct renderer *r, const struct light_box *box, const struct point *p)
 {
     const float *n = p->surface.normal, *x = p->surface.position_m, *c = r->lights.centre_m;
     const float towards_centre = n[0] * (c[0] - x[0]) + n[1] * (c[1] - x[1]) + n[2] * (c[2] - x[2]);
-    float highest = towards_centre * (towards_centre > 0 ? g->q_high : g->q_low);
+    float highest = towards_centre * (towards_centre > 0 ? box->q_high : box->q_low);
     for (int k = 0; k < 3; k++)
-        highest += n[k] * (n[k] > 0 ? g->high[k] : g->low[k]);
-    return highest;
+        highest += n[k] * (n[k] > 0 ? box->high[k] : box->low[k]);
+    return highest > -1e-5f;
 }
 
 // The light of the group at share x of its energy.
@@ -409,7 +464,7 @@ static void estimate_shares(const struct renderer *r, const struct point *p, con
         const struct light_group *group = &r->group[g];
         const uint64_t index = (uint64_t)g * GROUP_INDEX_STEP;
         uint8_t byte = 0;
-        if (highest_above_horizon(r, group, p) > 0) { // rounded up or down at random: no bias by the byte
+        if (may_rise(r, &group->box, p)) { // rounded up or down at random: no bias by the byte
             const double rounding = random_uniform(s.seed, s.stream, index + GROUP_INDEX_STEP - 1);
             const double x = 255. * group_share(r, group, p, start_m, s, index) + rounding;
             byte = x < 255 ? (uint8_t)x : 255;
@@ -420,28 +475,44 @@ static void estimate_shares(const struct renderer *r, const struct point *p, con
 
 // ---- light on a point -----------------------------------------------------------------------------------------------------
 
-// Direct light at p into s->lit, or for a Lambertian surface straight into the irradiance E.
-static void light_point(const struct renderer *r, const struct point *p, const float start_m[3],
-                        struct stream stream, struct scratch *s, bool only_irradiance, float E[3])
+// Find out which lights reach p: by bits or by bytes in s, or without looking where there are no shadows.
+static void find_shadows(const struct renderer *r, const struct point *p, const float start_m[3], struct stream stream,
+                         struct scratch *s)
+{
+    if (!r->settings.shadows)
+        return;
+    if (r->settings.shadow_rays > 0)
+        estimate_shares(r, p, start_m, stream, s->share);
+    else
+        trace_every_light(r, p, start_m, s->visible);
+}
+
+// Direct light: outgoing radiance towards v, or with v = NULL the irradiance. Call find_shadows() before.
+static void add_direct(const struct renderer *r, const struct point *p, const float v[3], struct scratch *s, float out[3])
 {
     const bool estimated = r->settings.shadows && r->settings.shadow_rays > 0;
-    const bool traced = r->settings.shadows && !estimated;
-    if (traced)
-        trace_every_light(r, p, start_m, s->visible);
-    if (estimated)
-        estimate_shares(r, p, start_m, stream, s->share);
-    if (only_irradiance && !estimated) {
-        r->kernels->irradiance(E, &r->lights, &p->surface, traced ? s->visible : NULL);
-        return;
-    }
-    r->kernels->gather(&s->lit, &r->lights, &p->surface, traced ? s->visible : NULL, estimated ? s->share : NULL);
-    if (!only_irradiance)
-        return;
     double sum[3] = { 0 };
-    for (int i = 0; i < s->lit.n; i++)
-        sum[0] += s->lit.wr[i], sum[1] += s->lit.wg[i], sum[2] += s->lit.wb[i];
+    for (int k = 0; k < r->n_tiles; k++) {
+        const struct light_tile *t = &r->tile[k];
+        const uint16_t *visible = r->settings.shadows && !estimated ? s->visible + t->begin / 16 : NULL;
+        const uint8_t *share = estimated ? s->share + t->begin : NULL;
+        float part[3] = { 0 };
+        if (!may_rise(r, &t->box, p))
+            continue;
+        if (!v && !estimated) {
+            r->kernels->irradiance(part, &t->lights, &p->surface, visible);
+        } else {
+            r->kernels->gather(&s->lit, &t->lights, &p->surface, visible, share);
+            if (v)
+                r->kernels->shade(part, &s->lit, &p->surface, v, &p->material);
+            for (int i = 0; !v && i < s->lit.n; i++)
+                part[0] += s->lit.wr[i], part[1] += s->lit.wg[i], part[2] += s->lit.wb[i];
+        }
+        for (int c = 0; c < 3; c++)
+            sum[c] += part[c];
+    }
     for (int c = 0; c < 3; c++)
-        E[c] = (float)sum[c];
+        out[c] = (float)sum[c];
 }
 
 static double radical_inverse2(uint32_t k)
@@ -489,7 +560,7 @@ static void shade_point(const struct renderer *r, const struct point *p, const f
                         struct stream stream, struct scratch *s, float L[3])
 {
     const bool lambert = r->material.model == REFLECT_LAMBERT, bounce = r->radiosity.data;
-    float start_m[3] = { 0 }, E[3] = { 0 }, indirect[3] = { 0 };
+    float start_m[3] = { 0 }, indirect[3] = { 0 };
     double v[3];
     for (int i = 0; i < 3; i++)
         v[i] = (double)eye_m[i] - p->surface.position_m[i];
@@ -497,23 +568,19 @@ static void shade_point(const struct renderer *r, const struct point *p, const f
     const float vf[3] = { (float)v[0], (float)v[1], (float)v[2] };
     if (r->settings.shadows || bounce)
         rays_start(r->rays, p->triangle, p->barycentric, start_m);
-    light_point(r, p, start_m, stream, s, lambert, E);
-    if (bounce)
+    find_shadows(r, p, start_m, stream, s);
+    add_direct(r, p, lambert ? NULL : vf, s, L);
+    if (bounce) {
         gather_bounce(r, p, start_m, stream, s);
-    if (lambert) {
-        if (bounce)
+        if (lambert) {
             r->kernels->irradiance(indirect, &s->bounced, &p->surface, NULL);
-        for (int c = 0; c < 3; c++)
-            L[c] = (E[c] + indirect[c]) * p->material.albedo[c] * (float)M_1_PI;
-        return;
+        } else {
+            r->kernels->gather(&s->lit, &s->bounced, &p->surface, NULL, NULL);
+            r->kernels->shade(indirect, &s->lit, &p->surface, vf, &p->material);
+        }
     }
-    r->kernels->shade(L, &s->lit, &p->surface, vf, &p->material);
-    if (!bounce)
-        return;
-    r->kernels->gather(&s->lit, &s->bounced, &p->surface, NULL, NULL);
-    r->kernels->shade(indirect, &s->lit, &p->surface, vf, &p->material);
     for (int c = 0; c < 3; c++)
-        L[c] += indirect[c];
+        L[c] = (L[c] + indirect[c]) * (lambert ? p->material.albedo[c] * (float)M_1_PI : 1);
 }
 
 // ---- radiosity ------------------------------------------------------------------------------------------------------------
@@ -536,7 +603,8 @@ static void light_texels(void *arg, int64_t begin, int64_t end, int worker)
         if (!get_point(r, t->triangle[i], t->barycentric[i], &p))
             continue;
         rays_start(r->rays, p.triangle, p.barycentric, start_m);
-        light_point(r, &p, start_m, (struct stream){ job->seed, t->pixel[i] }, &job->scratch[worker], true, E);
+        find_shadows(r, &p, start_m, (struct stream){ job->seed, t->pixel[i] }, &job->scratch[worker]);
+        add_direct(r, &p, NULL, &job->scratch[worker], E);
         const float diffuse = r->material.model == REFLECT_LAMBERT ? 1 : 1 - p.material.theta[DISNEY_METALLIC];
         for (int c = 0; c < 3; c++)
             r->radiosity.data[3 * (size_t)t->pixel[i] + (size_t)c] =
@@ -617,7 +685,7 @@ void renderer_free(struct renderer *r)
     if (!r)
         return;
     light_arrays_free(&r->lights);
-    free(r->cumulative);
+    free(r->cumulative), free(r->tile);
     image_free(&r->radiosity);
     free(r);
 }
