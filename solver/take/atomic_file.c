@@ -265,7 +265,7 @@ int file_read(char **bytes, size_t *n_bytes, const char *path, size_t max_bytes)
         }
         n += got > 0 ? (size_t)got : 0;
         if (n > room) // there is more
-            room = n < max_bytes && n > max_bytes / 2 ? max_bytes : n * 2;
+            room = n <= max_bytes && n > max_bytes / 2 ? max_bytes : n * 2;
     }
     close(fd);
     data[n] = 0;
