@@ -1,7 +1,9 @@
-// solver/synth.c - synthetic studios: lights on a cuboid, an object, cameras, and the take they give.
+// solver/synth.c - synthetic studios: lights on a cuboid, an object, cameras, and the take they
+// give.
 //
-// Ground truth first: lights, textures, mesh and cameras are made and written, then every view is rendered from exactly
-// those, noise added, clipped and written. All randomness is named by (seed, stream, index).
+// Ground truth first: lights, textures, mesh and cameras are made and written, then every view is
+// rendered from exactly those, noise added, clipped and written. All randomness is named by (seed,
+// stream, index).
 #include "solver/synth.h"
 #include "solver/cameras.h"
 #include "solver/panorama.h"
@@ -27,24 +29,40 @@
 #include <sys/stat.h>
 #include <unistd.h>
 
-enum { N_PANELS = 4, N_WALLS = 6, N_RELIT = 6, N_RINGS = 5, MAX_REGIONS = 4, SHADOW_RAYS = 2, BOUNCE_RAYS = 32 };
-enum { BOUNCE_TEXTURE = 256, GUTTER_PX = 8, MIN_PIXELS_PER_LIGHT = 8 };
-enum stream { STREAM_LIGHTS, STREAM_RELIT_LIGHTS, STREAM_ROTATION, STREAM_CAMERAS, STREAM_RELIT_CAMERAS, STREAM_PATTERN,
-              STREAM_NOISE = 1000, STREAM_RELIT_NOISE = 100000 };
+enum {
+    N_PANELS = 4,
+    N_WALLS = 6,
+    N_RELIT = 6,
+    N_RINGS = 5,
+    MAX_REGIONS = 4,
+    SHADOW_RAYS = 2,
+    BOUNCE_RAYS = 32
+};
+enum { BOUNCE_TEXTURE = 128, GUTTER_PX = 8, MIN_PIXELS_PER_LIGHT = 8 };
+enum stream {
+    STREAM_LIGHTS,
+    STREAM_RELIT_LIGHTS,
+    STREAM_ROTATION,
+    STREAM_CAMERAS,
+    STREAM_RELIT_CAMERAS,
+    STREAM_PATTERN,
+    STREAM_NOISE = 1000,
+    STREAM_RELIT_NOISE = 100000
+};
 
-static const double half_size_m[3] = { 1.8, 1.2, .6 }, middle_m[3] = { 0, 0, 1.2 };
-static const double off_centre_m[3] = { .35, .25, -.1 };
-static const double relit_probe_m[3] = { .04, -.06, 1.23 };
+static const double half_size_m[3] = {1.8, 1.2, .6}, middle_m[3] = {0, 0, 1.2};
+static const double off_centre_m[3] = {.35, .25, -.1};
+static const double relit_probe_m[3] = {.04, -.06, 1.23};
 static const double object_radius_m = .3, camera_radius_m = 1.8;
 static const double panel_radiance = 60; // of the dim walls
 static const double sphere_brightness = .25, sphere_albedo = .5;
 // What a user knows of the probe: its up is the world's up.
-static const double rough_world_from_probe[9] = { -1, 0, 0, 0, 0, 1, 0, 1, 0 };
+static const double rough_world_from_probe[9] = {-1, 0, 0, 0, 0, 1, 0, 1, 0};
 
-// ---- light ----------------------------------------------------------------------------------------------------------------
+// ---- light --------------------------------------------------------------------------------------
 //
-// Walls are numbered 2 axis + (1 on the positive side); a place on one has the coordinates of the next two axes, in turn,
-// from the cuboid's middle.
+// Walls are numbered 2 axis + (1 on the positive side); a place on one has the coordinates of the
+// next two axes, in turn, from the cuboid's middle.
 struct panel {
     int wall;
     double low[2], high[2]; // metres
@@ -52,16 +70,16 @@ struct panel {
 };
 
 static const struct panel studio_panels[N_PANELS] = {
-    { 5, { -.9, -.5 }, { .1, .3 }, { 1.02, 1, .94 } },   // ceiling
-    { 0, { -.6, -.25 }, { .4, .45 }, { .9, 1, 1.12 } },  // x = -1.8
-    { 2, { -.3, .2 }, { .4, 1.2 }, { 1, 1, 1 } },        // y = -1.2
-    { 1, { -.1, -.4 }, { .8, .2 }, { 1.12, .98, .84 } }, // x = 1.8
+    {5, {-.9, -.5}, {.1, .3}, {1.02, 1, .94}},   // ceiling
+    {0, {-.6, -.25}, {.4, .45}, {.9, 1, 1.12}},  // x = -1.8
+    {2, {-.3, .2}, {.4, 1.2}, {1, 1, 1}},        // y = -1.2
+    {1, {-.1, -.4}, {.8, .2}, {1.12, .98, .84}}, // x = 1.8
 };
 static const struct panel relit_panels[N_PANELS] = {
-    { 5, { .3, -.2 }, { 1.3, .6 }, { 1, 1, 1 } },
-    { 3, { -.2, -1.2 }, { .4, 0 }, { 1.12, .98, .84 } },
-    { 0, { -.9, -.45 }, { -.1, .15 }, { .95, 1, 1.06 } },
-    { 2, { 0, -1.4 }, { .5, -.4 }, { .88, 1, 1.15 } },
+    {5, {.3, -.2}, {1.3, .6}, {1, 1, 1}},
+    {3, {-.2, -1.2}, {.4, 0}, {1.12, .98, .84}},
+    {0, {-.9, -.45}, {-.1, .15}, {.95, 1, 1.06}},
+    {2, {0, -1.4}, {.5, -.4}, {.88, 1, 1.15}},
 };
 
 struct studio {
@@ -93,8 +111,8 @@ static int radiance_at(const struct studio *s, int wall, const double at[2], dou
 {
     for (int k = 0; k < N_PANELS; k++) {
         const struct panel *p = &s->panels[k];
-        if (s->uniform || p->wall != wall || at[0] < p->low[0] || at[0] > p->high[0] || at[1] < p->low[1] ||
-            at[1] > p->high[1])
+        if (s->uniform || p->wall != wall || at[0] < p->low[0] || at[0] > p->high[0] ||
+            at[1] < p->low[1] || at[1] > p->high[1])
             continue;
         for (int c = 0; c < 3; c++)
             radiance[c] = panel_radiance * p->tint[c];
@@ -121,7 +139,8 @@ static int meet_wall(const double from_m[3], const double dir[3], double at[2], 
     return 2 * axis + (dir[axis] > 0);
 }
 
-// Cells per wall by area, exactly n in all: whole shares first, what is left to the largest remainders.
+// Cells per wall by area, exactly n in all: whole shares first, what is left to the largest
+// remainders.
 static void count_cells(int n, int n_cells[N_WALLS])
 {
     double total = 0, rest[N_WALLS];
@@ -143,8 +162,8 @@ static void count_cells(int n, int n_cells[N_WALLS])
     }
 }
 
-// A jittered place in cell i of n equal cells that tile [-1, 1]^2: row r has the cells [r n / R, (r + 1) n / R), and is as high as
-// they are many.
+// A jittered place in cell i of n equal cells that tile [-1, 1]^2: row r has the cells [r n / R, (r
+// + 1) n / R), and is as high as they are many.
 static void place_in_cell(int i, int n, double aspect, double x, double y, double at[2])
 {
     const int n_rows = (int)fmin(fmax(round(sqrt(n / aspect)), 1), n);
@@ -171,17 +190,19 @@ static int64_t take_pixel(uint8_t *taken, int width, int height, int x, int y)
     }
 }
 
-static int studio_new(struct studio *s, const struct synth_settings *settings, const struct panel *panels,
-                      const double centre_m[3], const double world_from_probe[9], enum stream stream)
+static int studio_new(struct studio *s, const struct synth_settings *settings,
+                      const struct panel *panels, const double centre_m[3],
+                      const double world_from_probe[9], enum stream stream)
 {
     const int n = settings->n_true_lights, width = settings->panorama_width_px, height = width / 2;
     int n_cells[N_WALLS], i = 0;
     double sum = 0;
     int err = -ENOMEM;
-    *s = (struct studio){ .panels = panels, .uniform = settings->uniform_cuboid };
+    *s = (struct studio){.panels = panels, .uniform = settings->uniform_cuboid};
     uint8_t *taken = calloc((size_t)width * (size_t)height, 1);
     int64_t *pixel = malloc((size_t)n * sizeof(*pixel));
-    if (!taken || !pixel || lights_new(&s->lights, n) || image_new(&s->panorama, width, height, 3, NULL))
+    if (!taken || !pixel || lights_new(&s->lights, n) ||
+        image_new(&s->panorama, width, height, 3, NULL))
         goto done;
     memcpy(s->lights.centre_m, centre_m, 3 * sizeof(double));
     memcpy(s->lights.world_from_probe, world_from_probe, 9 * sizeof(double));
@@ -205,14 +226,16 @@ static int studio_new(struct studio *s, const struct synth_settings *settings, c
             pixel[i] = take_pixel(taken, width, height, (int)fmin(fmax(x_px, 0), width - 1),
                                   (int)fmin(fmax(y_px, 0), height - 1));
             // From here the light is where the pixel's centre looks.
-            panorama_direction(width, height, (double)(pixel[i] % width) + .5, (double)(pixel[i] / width) + .5, dir_probe);
+            panorama_direction(width, height, (double)(pixel[i] % width) + .5,
+                               (double)(pixel[i] / width) + .5, dir_probe);
             memcpy(s->lights.dir_probe[i], dir_probe, sizeof(dir_probe));
             mat3_mul_vec(dir, world_from_probe, dir_probe);
             const int met = meet_wall(centre_m, dir, at, &r_m);
             s->lights.group[i] = radiance_at(s, met, at, radiance);
             s->lights.inverse_distance[i] = settings->directional ? 0 : 1 / r_m;
             for (int k = 0; k < 3; k++)
-                s->lights.irradiance[i][k] = radiance[k] * area_m2 * fabs(dir[met / 2]) / (r_m * r_m);
+                s->lights.irradiance[i][k] =
+                    radiance[k] * area_m2 * fabs(dir[met / 2]) / (r_m * r_m);
             sum += luminance(s->lights.irradiance[i]);
         }
     }
@@ -222,7 +245,8 @@ static int studio_new(struct studio *s, const struct synth_settings *settings, c
         const double solid_angle = panorama_solid_angle(width, height, (int)(pixel[i] / width));
         const bool missing = settings->one_panel_missing_from_panorama && s->lights.group[i] == 1;
         for (int k = 0; k < 3; k++) { // through the panorama's float, so that both agree to the bit
-            const float radiance = (float)(s->lights.irradiance[i][k] * s->unit_radiance / solid_angle);
+            const float radiance =
+                (float)(s->lights.irradiance[i][k] * s->unit_radiance / solid_angle);
             s->lights.irradiance[i][k] = (double)radiance * solid_angle;
             s->panorama.data[3 * pixel[i] + k] = missing ? 0 : radiance;
         }
@@ -235,13 +259,13 @@ done:
     return err;
 }
 
-static void append_panel(struct json *list, int id, int wall, const double low[2], const double high[2],
-                         const double radiance[3], double unit)
+static void append_panel(struct json *list, int id, int wall, const double low[2],
+                         const double high[2], const double radiance[3], double unit)
 {
     // u x v is the inward normal; on the positive walls that swaps the wall's two coordinates.
     const int swap = wall % 2, a = wall / 2, u = (a + 1 + swap) % 3, v = (a + 2 - swap) % 3;
-    const double rgb[3] = { unit * radiance[0], unit * radiance[1], unit * radiance[2] };
-    double axis[3][3] = { { 0 } }, corner[4][3], centre[3] = { 0 };
+    const double rgb[3] = {unit * radiance[0], unit * radiance[1], unit * radiance[2]};
+    double axis[3][3] = {{0}}, corner[4][3], centre[3] = {0};
     char text[512];
     size_t n = 0;
     axis[0][u] = axis[1][v] = 1;
@@ -251,8 +275,8 @@ static void append_panel(struct json *list, int id, int wall, const double low[2
         corner[k][u] = middle_m[u] + (k == 1 || k == 2 ? high[swap] : low[swap]);
         corner[k][v] = middle_m[v] + (k >= 2 ? high[!swap] : low[!swap]);
         vec3_add_scaled(centre, centre, .25, corner[k]);
-        n += (size_t)snprintf(text + n, sizeof(text) - n, "%c[%.17g,%.17g,%.17g]", k ? ',' : '[', corner[k][0],
-                              corner[k][1], corner[k][2]);
+        n += (size_t)snprintf(text + n, sizeof(text) - n, "%c[%.17g,%.17g,%.17g]", k ? ',' : '[',
+                              corner[k][0], corner[k][1], corner[k][2]);
     }
     n += (size_t)snprintf(text + n, sizeof(text) - n, "]");
     struct json *panel = json_object(), *corners = NULL;
@@ -272,27 +296,30 @@ static void append_panel(struct json *list, int id, int wall, const double low[2
 // The panels in front, then the dim walls behind them: together everything that shines.
 static int write_panels(const struct studio *s, const char *path)
 {
-    static const double grey[3] = { 1, 1, 1 };
+    static const double grey[3] = {1, 1, 1};
     struct json *doc = json_object(), *list = json_array();
     for (int k = 0; k < N_PANELS && !s->uniform; k++) {
         const struct panel *p = &s->panels[k];
-        const double radiance[3] = { panel_radiance * p->tint[0], panel_radiance * p->tint[1],
-                                     panel_radiance * p->tint[2] };
+        const double radiance[3] = {panel_radiance * p->tint[0], panel_radiance * p->tint[1],
+                                    panel_radiance * p->tint[2]};
         append_panel(list, k, p->wall, p->low, p->high, radiance, s->unit_radiance);
     }
     for (int wall = 0; wall < N_WALLS; wall++) {
-        const double high[2] = { half_size_m[(wall / 2 + 1) % 3], half_size_m[(wall / 2 + 2) % 3] };
-        const double low[2] = { -high[0], -high[1] };
+        const double high[2] = {half_size_m[(wall / 2 + 1) % 3], half_size_m[(wall / 2 + 2) % 3]};
+        const double low[2] = {-high[0], -high[1]};
         append_panel(list, N_PANELS + wall, wall, low, high, grey, s->unit_radiance);
     }
-    json_set_string(doc, "note", "0..3: bright panels; 4..9: the dim walls they hang on (x-, x+, y-, y+, z-, z+)");
+    json_set_string(
+        doc, "note",
+        "0..3: bright panels; 4..9: the dim walls they hang on (x-, x+, y-, y+, z-, z+)");
     json_set(doc, "panels", list);
     const int err = json_write(doc, path);
     json_free(doc);
     return err;
 }
 
-static int write_probe(const double *centre_m, const double world_from_probe[9], const char *note, const char *path)
+static int write_probe(const double *centre_m, const double world_from_probe[9], const char *note,
+                       const char *path)
 {
     struct json *doc = json_object();
     if (centre_m)
@@ -319,16 +346,17 @@ static void true_rotation(uint64_t seed, double world_from_probe[9])
     mat3_mul(world_from_probe, turn, rough_world_from_probe);
 }
 
-// ---- cameras ----------------------------------------------------------------------------------------------------------------
+// ---- cameras ------------------------------------------------------------------------------------
 
 // Like real ones, no two lenses are quite equal: focal length +-3%, principal point +-1%.
-static void aim(struct camera *c, int index, const struct synth_settings *s, enum stream stream, const double target_m[3],
-                double azimuth_rad, double elevation_rad)
+static void aim(struct camera *c, int index, const struct synth_settings *s, enum stream stream,
+                const double target_m[3], double azimuth_rad, double elevation_rad)
 {
-    static const double up[3] = { 0, 0, 1 };
-    const double centre_m[3] = { target_m[0] + camera_radius_m * cos(elevation_rad) * cos(azimuth_rad),
-                                 target_m[1] + camera_radius_m * cos(elevation_rad) * sin(azimuth_rad),
-                                 target_m[2] + camera_radius_m * sin(elevation_rad) };
+    static const double up[3] = {0, 0, 1};
+    const double centre_m[3] = {
+        target_m[0] + camera_radius_m * cos(elevation_rad) * cos(azimuth_rad),
+        target_m[1] + camera_radius_m * cos(elevation_rad) * sin(azimuth_rad),
+        target_m[2] + camera_radius_m * sin(elevation_rad)};
     double vary[3];
     for (int k = 0; k < 3; k++)
         vary[k] = 2 * random_uniform(s->seed, stream, 3 * (uint64_t)index + (uint64_t)k) - 1;
@@ -337,52 +365,56 @@ static void aim(struct camera *c, int index, const struct synth_settings *s, enu
     c->width_px = s->width_px, c->height_px = s->height_px;
     c->model = CAMERA_BROWN;
     // the bounding sphere fills 90% of the shorter side
-    c->fx = c->fy = .9 * half_px / tan(asin(object_radius_m / camera_radius_m)) * (1 + .03 * vary[0]);
+    c->fx = c->fy =
+        .9 * half_px / tan(asin(object_radius_m / camera_radius_m)) * (1 + .03 * vary[0]);
     c->cx = s->width_px / 2. + .01 * s->width_px * vary[1];
     c->cy = s->height_px / 2. + .01 * s->height_px * vary[2];
     camera_look_at(c, centre_m, target_m, up);
 }
 
-static int make_cameras(struct cameras *out, int n, const struct synth_settings *s, const double target_m[3])
+static int make_cameras(struct cameras *out, int n, const struct synth_settings *s,
+                        const double target_m[3])
 {
-    static const double elevation_deg[N_RINGS] = { 10, -15, 35, -40, 60 };
+    static const double elevation_deg[N_RINGS] = {10, -15, 35, -40, 60};
     out->view = calloc((size_t)n, sizeof(*out->view));
     if (!out->view)
         return -ENOMEM;
     for (int ring = 0; ring < N_RINGS; ring++) {
         const int n_ring = n / N_RINGS + (ring < n % N_RINGS);
         for (int k = 0; k < n_ring; k++, out->n++)
-            aim(&out->view[out->n], out->n, s, STREAM_CAMERAS, target_m, 2 * M_PI * (k + .2 * ring) / n_ring,
-                elevation_deg[ring] * M_PI / 180);
+            aim(&out->view[out->n], out->n, s, STREAM_CAMERAS, target_m,
+                2 * M_PI * (k + .2 * ring) / n_ring, elevation_deg[ring] * M_PI / 180);
     }
     return 0;
 }
 
-static int make_relit_cameras(struct cameras *out, const struct synth_settings *s, const double target_m[3])
+static int make_relit_cameras(struct cameras *out, const struct synth_settings *s,
+                              const double target_m[3])
 {
-    static const double elevation_deg[N_RELIT] = { 25, -5, 45, 5, -25, 50 };
+    static const double elevation_deg[N_RELIT] = {25, -5, 45, 5, -25, 50};
     out->view = calloc(N_RELIT, sizeof(*out->view));
     if (!out->view)
         return -ENOMEM;
     for (; out->n < N_RELIT; out->n++)
-        aim(&out->view[out->n], out->n, s, STREAM_RELIT_CAMERAS, target_m, 2 * M_PI * (out->n + .22) / N_RELIT,
-            elevation_deg[out->n] * M_PI / 180);
+        aim(&out->view[out->n], out->n, s, STREAM_RELIT_CAMERAS, target_m,
+            2 * M_PI * (out->n + .22) / N_RELIT, elevation_deg[out->n] * M_PI / 180);
     return 0;
 }
 
-// ---- material ----------------------------------------------------------------------------------------------------------------
+// ---- material -----------------------------------------------------------------------------------
 
 struct region {
     const char *name;
-    double theta[DISNEY_N]; // metallic subsurface specular roughness specularTint anisotropic sheen sheenTint clearcoat gloss
+    double theta[DISNEY_N]; // metallic subsurface specular roughness specularTint anisotropic sheen
+                            // sheenTint clearcoat gloss
 };
 
-static const struct region paper_theta[] = { { "paper", { .2, .2, .5, .6, .9, 0, .3, .4, .2, .2 } } };
+static const struct region paper_theta[] = {{"paper", {.2, .2, .5, .6, .9, 0, .3, .4, .2, .2}}};
 static const struct region vase_regions[MAX_REGIONS] = {
-    { "glaze", { 0, 0, .5, .35, .2, 0, 0, 0, .6, .8 } },
-    { "brass", { 1, 0, .5, .4, 0, .3, 0, 0, 0, 0 } },
-    { "felt", { 0, .3, .2, .9, 0, 0, .8, .5, 0, 0 } },
-    { "satin", { 0, 0, .45, .55, .6, 0, 0, 0, .15, .5 } },
+    {"glaze", {0, 0, .5, .35, .2, 0, 0, 0, .6, .8}},
+    {"brass", {1, 0, .5, .4, 0, .3, 0, 0, 0, 0}},
+    {"felt", {0, .3, .2, .9, 0, 0, .8, .5, 0, 0}},
+    {"satin", {0, 0, .45, .55, .6, 0, 0, 0, .15, .5}},
 };
 
 // Smooth noise in [0, 1] of a place: trilinear between random corners, three octaves.
@@ -415,15 +447,18 @@ static double noise_at(const double x[3], double cells, uint64_t stream)
 // Three clays that flow into each other. x: place in the bounding sphere's unit ball.
 static void clay_albedo(const double x[3], double albedo[3])
 {
-    static const double colour[3][3] = { { .62, .2, .1 }, { .07, .34, .4 }, { .74, .6, .3 } };
+    static const double colour[3][3] = {{.62, .2, .1}, {.07, .34, .4}, {.74, .6, .3}};
     const double bend = 1.3 * sin(1.9 * x[2] + .5);
-    const double w[3] = { exp(2.2 * sin(3.1 * x[0] + bend + .3)), exp(2.2 * sin(2.7 * x[1] - bend + 1.9)),
-                          exp(2.2 * sin(2.9 * x[2] + 1.4 * x[0] + 4.1)) };
+    const double w[3] = {exp(2.2 * sin(3.1 * x[0] + bend + .3)),
+                         exp(2.2 * sin(2.7 * x[1] - bend + 1.9)),
+                         exp(2.2 * sin(2.9 * x[2] + 1.4 * x[0] + 4.1))};
     for (int c = 0; c < 3; c++)
-        albedo[c] = (w[0] * colour[0][c] + w[1] * colour[1][c] + w[2] * colour[2][c]) / (w[0] + w[1] + w[2]);
+        albedo[c] = (w[0] * colour[0][c] + w[1] * colour[1][c] + w[2] * colour[2][c]) /
+                    (w[0] + w[1] + w[2]);
 }
 
-// Painted vase: glaze below and around, felt diamonds, brass bands, a satin neck. Borders are steps.
+// Painted vase: glaze below and around, felt diamonds, brass bands, a satin neck. Borders are
+// steps.
 static int vase_region(const double x[3])
 {
     const double angle = atan2(x[1], x[0]);
@@ -437,20 +472,21 @@ static int vase_region(const double x[3])
 static void vase_albedo(const double x[3], int region, double albedo[3])
 {
     static const double colour[MAX_REGIONS][2][3] = {
-        { { .78, .76, .7 }, { .05, .11, .35 } },  // white with cobalt strokes
-        { { .8, .57, .24 }, { .62, .42, .15 } },
-        { { .42, .03, .04 }, { .2, .015, .03 } },
-        { { .09, .24, .12 }, { .2, .4, .2 } },
+        {{.78, .76, .7}, {.05, .11, .35}}, // white with cobalt strokes
+        {{.8, .57, .24}, {.62, .42, .15}},
+        {{.42, .03, .04}, {.2, .015, .03}},
+        {{.09, .24, .12}, {.2, .4, .2}},
     };
     const double n = noise_at(x, 6, 1), fine = noise_at(x, 40, 2);
     double mix = region == 0 ? fmin(fmax(14 * (fabs(n - .5) - .03), 0), 1) : n;
     mix = region == 0 ? 1 - mix : mix;
     for (int c = 0; c < 3; c++)
-        albedo[c] = (colour[region][0][c] + mix * (colour[region][1][c] - colour[region][0][c])) * (.8 + .4 * fine);
+        albedo[c] = (colour[region][0][c] + mix * (colour[region][1][c] - colour[region][0][c])) *
+                    (.8 + .4 * fine);
 }
 
 struct textures {
-    int n_regions;              // 0: Lambertian
+    int n_regions; // 0: Lambertian
     const struct region *region;
     struct image albedo, parameters, region_id; // parameters: none for Lambert
 };
@@ -474,7 +510,7 @@ static void paint_texels(void *arg, int64_t begin, int64_t end, int worker)
     struct textures *out = job->textures;
     for (int64_t i = begin; i < end; i++) {
         const size_t pixel = job->texels->pixel[i];
-        double x[3], albedo[3] = { .5, .5, .5 };
+        double x[3], albedo[3] = {.5, .5, .5};
         int region = 0;
         for (int k = 0; k < 3; k++)
             x[k] = (job->texels->position_m[i][k] - job->centre_m[k]) / object_radius_m;
@@ -487,19 +523,22 @@ static void paint_texels(void *arg, int64_t begin, int64_t end, int worker)
         for (int c = 0; c < 3; c++)
             out->albedo.data[3 * pixel + (size_t)c] = (float)albedo[c];
         for (int k = 0; k < DISNEY_N && out->n_regions; k++)
-            out->parameters.data[DISNEY_N * pixel + (size_t)k] = (float)out->region[region].theta[k];
+            out->parameters.data[DISNEY_N * pixel + (size_t)k] =
+                (float)out->region[region].theta[k];
         out->region_id.data[pixel] = (float)region;
     }
 }
 
-static int make_textures(struct textures *out, const struct mesh *mesh, const struct synth_settings *s,
-                         const double centre_m[3])
+static int make_textures(struct textures *out, const struct mesh *mesh,
+                         const struct synth_settings *s, const double centre_m[3])
 {
-    static const char *const id_name[] = { "Y" };
+    static const char *const id_name[] = {"Y"};
     const int size = s->texture_size;
-    struct texels texels = { 0 };
-    *out = (struct textures){ .n_regions = s->data_set < 3 ? 0 : s->data_set == 5 ? MAX_REGIONS : 1,
-                              .region = s->data_set == 5 ? vase_regions : paper_theta };
+    struct texels texels = {0};
+    *out = (struct textures){.n_regions = s->data_set < 3    ? 0
+                                          : s->data_set == 5 ? MAX_REGIONS
+                                                             : 1,
+                             .region = s->data_set == 5 ? vase_regions : paper_theta};
     int err = texels_rasterise(&texels, mesh, size);
     if (!err)
         err = image_new(&out->albedo, size, size, 3, NULL);
@@ -509,7 +548,7 @@ static int make_textures(struct textures *out, const struct mesh *mesh, const st
         err = image_new(&out->parameters, size, size, DISNEY_N, disney_parameter_names);
     if (err)
         goto done;
-    struct paint_job job = { s->data_set, out, &texels, centre_m };
+    struct paint_job job = {s->data_set, out, &texels, centre_m};
     parallel_for(s->n_threads, texels.n, 4096, paint_texels, &job);
     err = texels_fill_gutter(&texels, out->albedo.data, 3, GUTTER_PX);
     if (!err)
@@ -529,7 +568,10 @@ static int write_material(const struct textures *t, int data_set, const char *pa
     json_set_int(doc, "data_set", data_set);
     json_set_string(doc, "model", t->n_regions ? "disney" : "lambert");
     json_set_string(doc, "variant", disney_variant_name(DISNEY_2017));
-    json_set_string(doc, "albedo", data_set < 3 ? ".5" : data_set == 5 ? "detailed, by region" : "smooth, coloured");
+    json_set_string(doc, "albedo",
+                    data_set < 3    ? ".5"
+                    : data_set == 5 ? "detailed, by region"
+                                    : "smooth, coloured");
     for (int i = 0; i < t->n_regions; i++) {
         struct json *region = json_object();
         json_set_int(region, "id", i);
@@ -544,7 +586,7 @@ static int write_material(const struct textures *t, int data_set, const char *pa
     return err;
 }
 
-// ---- the take -----------------------------------------------------------------------------------------------------------------
+// ---- the take -----------------------------------------------------------------------------------
 
 // Where everything goes while it is made, and what it is made of.
 struct job {
@@ -575,8 +617,8 @@ static int make_folder(const struct job *job, const char *name)
     return err ? err : make_directories(path);
 }
 
-static int write_image(const struct job *job, const struct image *image, const char *name, enum image_type type,
-                       enum image_compression compression)
+static int write_image(const struct job *job, const struct image *image, const char *name,
+                       enum image_type type, enum image_compression compression)
 {
     char path[PATH_MAX];
     const int err = path_of(job, path, name);
@@ -625,7 +667,8 @@ static int write_report(const struct job *job)
     json_set_bool(doc, "uniform_cuboid", s->uniform_cuboid);
     json_set_bool(doc, "one_panel_missing_from_panorama", s->one_panel_missing_from_panorama);
     json_set_number(doc, "clipped_percent",
-                    100. * (double)job->n_clipped_pixels / (double)(job->n_object_pixels ? job->n_object_pixels : 1));
+                    100. * (double)job->n_clipped_pixels /
+                        (double)(job->n_object_pixels ? job->n_object_pixels : 1));
     json_set_string(doc, "variant", disney_variant_name(DISNEY_2017));
     json_set_string(inputs, "mesh", "../geometry/mesh.obj");
     json_set_string(inputs, "cameras", "../geometry/cameras");
@@ -646,13 +689,13 @@ static int write_report(const struct job *job)
 }
 
 // Render, add noise, clip, write.
-static int take_picture(struct job *job, const struct renderer *renderer, const struct camera *camera,
-                        const char *folder, uint64_t noise_stream)
+static int take_picture(struct job *job, const struct renderer *renderer,
+                        const struct camera *camera, const char *folder, uint64_t noise_stream)
 {
-    static const char *const names[4] = { "R", "G", "B", "clip" };
+    static const char *const names[4] = {"R", "G", "B", "clip"};
     const struct synth_settings *s = job->settings;
     char name[CAMERA_NAME_MAX + 64];
-    struct image image, stored = { 0 };
+    struct image image, stored = {0};
     int err = render_view(renderer, camera, &image);
     if (err)
         return err;
@@ -661,7 +704,9 @@ static int take_picture(struct job *job, const struct renderer *renderer, const 
     for (int64_t i = 0; !err && i < n_pixels; i++) {
         float *to = stored.data + 4 * i;
         for (int c = 0; c < 3; c++) {
-            const double noise = s->noise > 0 ? s->noise * random_normal(s->seed, noise_stream, (uint64_t)(3 * i + c)) : 0;
+            const double noise = s->noise > 0 ? s->noise * random_normal(s->seed, noise_stream,
+                                                                         (uint64_t)(3 * i + c))
+                                              : 0;
             const double value = image.data[4 * i + c] + noise;
             to[c] = (float)fmin(value, 1);
             if (value >= 1)
@@ -679,8 +724,8 @@ static int take_picture(struct job *job, const struct renderer *renderer, const 
     return err;
 }
 
-static int take_pictures(struct job *job, const struct studio *studio, const struct cameras *cameras, const char *folder,
-                         uint64_t noise_stream)
+static int take_pictures(struct job *job, const struct studio *studio,
+                         const struct cameras *cameras, const char *folder, uint64_t noise_stream)
 {
     const struct render_material material = {
         .model = job->textures.n_regions ? REFLECT_DISNEY : REFLECT_LAMBERT,
@@ -690,7 +735,8 @@ static int take_pictures(struct job *job, const struct studio *studio, const str
         .nearest = job->settings->data_set == 5,
     };
     struct renderer *renderer;
-    int err = renderer_new(&renderer, &job->mesh, job->rays, &studio->lights, &material, &job->render);
+    int err =
+        renderer_new(&renderer, &job->mesh, job->rays, &studio->lights, &material, &job->render);
     for (int i = 0; !err && i < cameras->n; i++)
         err = take_picture(job, renderer, &cameras->view[i], folder, noise_stream + (uint64_t)i);
     renderer_free(renderer);
@@ -699,7 +745,7 @@ static int take_pictures(struct job *job, const struct studio *studio, const str
 
 static int prepare(struct job *job)
 {
-    static const char *const own_shape[6] = { "", "pebble", "pebble", "pebble", "knot", "vase" };
+    static const char *const own_shape[6] = {"", "pebble", "pebble", "pebble", "knot", "vase"};
     const struct synth_settings *s = job->settings;
     const char *name = s->shape ? s->shape : own_shape[s->data_set];
     int shape = 0;
@@ -709,11 +755,15 @@ static int prepare(struct job *job)
     for (int k = 0; k < 3; k++)
         job->object_m[k] = middle_m[k] + (s->data_set == 1 ? 0 : off_centre_m[k]);
     true_rotation(s->seed, job->world_from_probe);
-    job->render = (struct render_settings){ .samples = s->samples, .shadows = s->data_set >= 4, .shadow_rays = SHADOW_RAYS,
-                                            .bounce_rays = s->data_set == 4 ? BOUNCE_RAYS : 0,
-                                            .bounce_texture = BOUNCE_TEXTURE, .seed = s->seed,
-                                            .n_threads = s->n_threads };
-    int err = shape_make(&job->mesh, shape, job->object_m, object_radius_m, shape == SHAPE_PEBBLE ? 40000 : 80000);
+    job->render = (struct render_settings){.samples = s->samples,
+                                           .shadows = s->data_set >= 4,
+                                           .shadow_rays = SHADOW_RAYS,
+                                           .bounce_rays = s->data_set == 4 ? BOUNCE_RAYS : 0,
+                                           .bounce_texture = BOUNCE_TEXTURE,
+                                           .seed = s->seed,
+                                           .n_threads = s->n_threads};
+    int err = shape_make(&job->mesh, shape, job->object_m, object_radius_m,
+                         shape == SHAPE_PEBBLE ? 40000 : 80000);
     if (!err)
         err = rays_new(&job->rays, &job->mesh);
     if (!err)
@@ -723,9 +773,11 @@ static int prepare(struct job *job)
     if (!err)
         err = make_relit_cameras(&job->relit_cameras, s, job->object_m);
     if (!err)
-        err = studio_new(&job->studio, s, studio_panels, job->centre_m, job->world_from_probe, STREAM_LIGHTS);
+        err = studio_new(&job->studio, s, studio_panels, job->centre_m, job->world_from_probe,
+                         STREAM_LIGHTS);
     if (!err)
-        err = studio_new(&job->relit, s, relit_panels, relit_probe_m, rough_world_from_probe, STREAM_RELIT_LIGHTS);
+        err = studio_new(&job->relit, s, relit_panels, relit_probe_m, rough_world_from_probe,
+                         STREAM_RELIT_LIGHTS);
     return err;
 }
 
@@ -733,7 +785,8 @@ static int write_known(struct job *job)
 {
     const struct synth_settings *s = job->settings;
     char name[64], path[PATH_MAX];
-    snprintf(name, sizeof(name), "synthetic D%d, seed %llu", s->data_set, (unsigned long long)s->seed);
+    snprintf(name, sizeof(name), "synthetic D%d, seed %llu", s->data_set,
+             (unsigned long long)s->seed);
     // A fixed date: equal settings give equal bytes.
     int err = take_create(job->dir, name, "2020-03-01T00:00:00Z", "ready");
     if (!err)
@@ -750,7 +803,9 @@ static int write_known(struct job *job)
         err = cameras_write_colmap_text(&job->relit_cameras, path);
     if (!err && !(err = path_of(job, path, "start.json")))
         err = write_probe(NULL, rough_world_from_probe,
-                          "rough: the true rotation is 2-10 degrees off; start the centre at the mesh bounding-box centre", path);
+                          "rough: the true rotation is 2-10 degrees off; start the centre at the "
+                          "mesh bounding-box centre",
+                          path);
     if (!err)
         err = write_view_list(job, "fit.txt", 0);
     if (!err)
@@ -778,7 +833,8 @@ static int write_known(struct job *job)
     if (!err && job->textures.n_regions)
         err = write_image(job, &job->textures.parameters, "truth/brdf.exr", IMAGE_FLOAT, IMAGE_ZIP);
     if (!err)
-        err = write_image(job, &job->textures.region_id, "truth/region_id.exr", IMAGE_HALF, IMAGE_ZIP);
+        err = write_image(job, &job->textures.region_id, "truth/region_id.exr", IMAGE_HALF,
+                          IMAGE_ZIP);
     return err;
 }
 
@@ -797,7 +853,8 @@ static int write_all(const struct synth_settings *s, const char *dir)
         if (!err)
             err = write_report(job);
         if (!err)
-            err = take_pictures(job, &job->relit, &job->relit_cameras, "relit/linear", STREAM_RELIT_NOISE);
+            err = take_pictures(job, &job->relit, &job->relit_cameras, "relit/linear",
+                                STREAM_RELIT_NOISE);
         progress_end();
     }
     studio_free(&job->studio), studio_free(&job->relit);
@@ -809,7 +866,7 @@ static int write_all(const struct synth_settings *s, const char *dir)
     return err;
 }
 
-// ---- settings, and a folder that is whole or not there -----------------------------------------------------------------------
+// ---- settings, and a folder that is whole or not there ------------------------------------------
 
 struct synth_settings synth_defaults(int data_set)
 {
@@ -817,11 +874,14 @@ struct synth_settings synth_defaults(int data_set)
         .data_set = data_set,
         .seed = 1,
         .n_true_lights = LIGHTS_MAX,
-        .width_px = 360, .height_px = 240,
+        .width_px = 360,
+        .height_px = 240,
         .n_views = 85,
         .samples = 2,
         .panorama_width_px = 2048,
-        .texture_size = data_set == 5 ? 2048 : data_set >= 3 ? 512 : 64,
+        .texture_size = data_set == 5   ? 2048
+                        : data_set >= 3 ? 512
+                                        : 64,
     };
 }
 
@@ -842,15 +902,19 @@ static int check(const struct synth_settings *s)
         log_error("synth: no shape '%s'; there are pebble, vase, knot and bowl", s->shape);
         return -EINVAL;
     }
-    if (!in_range("the data set", s->data_set, 1, 5) || !in_range("the number of lights", s->n_true_lights, 16, LIGHTS_MAX) ||
+    if (!in_range("the data set", s->data_set, 1, 5) ||
+        !in_range("the number of lights", s->n_true_lights, 16, LIGHTS_MAX) ||
         !in_range("the noise", s->noise, 0, 1) || !in_range("the width", s->width_px, 16, 8192) ||
-        !in_range("the height", s->height_px, 16, 8192) || !in_range("the number of views", s->n_views, 1, 999) ||
-        !in_range("the samples per side", s->samples, 1, 16) || !in_range("the texture's size", s->texture_size, 32, 8192) ||
+        !in_range("the height", s->height_px, 16, 8192) ||
+        !in_range("the number of views", s->n_views, 1, 999) ||
+        !in_range("the samples per side", s->samples, 1, 16) ||
+        !in_range("the texture's size", s->texture_size, 32, 8192) ||
         !in_range("the panorama's width", s->panorama_width_px, 32, 16384))
         return -EINVAL;
     const double n_pixels = (double)s->panorama_width_px * (s->panorama_width_px / 2);
     if (s->panorama_width_px % 2 || n_pixels < (double)MIN_PIXELS_PER_LIGHT * s->n_true_lights) {
-        log_error("synth: a panorama %d px wide cannot hold %d lights; it must be even and have %d pixels per light",
+        log_error("synth: a panorama %d px wide cannot hold %d lights; it must be even and have %d "
+                  "pixels per light",
                   s->panorama_width_px, s->n_true_lights, MIN_PIXELS_PER_LIGHT);
         return -EINVAL;
     }

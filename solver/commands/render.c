@@ -1,7 +1,9 @@
-// solver/commands/render.c - rigsolve render: a solved (or true) material from new views, under its own light or another.
+// solver/commands/render.c - rigsolve render: a solved (or true) material from new views, under its
+// own light or another.
 //
-// SOLVE_DIR holds albedo.exr, brdf.exr (absent: Lambertian), lights.json and report.json, which names the mesh and may say how its
-// pictures were made ("render": samples, shadows, ...). Options beat the report.
+// SOLVE_DIR holds albedo.exr, brdf.exr (absent: Lambertian), lights.json and report.json, which
+// names the mesh and may say how its pictures were made ("render": samples, shadows, ...). Options
+// beat the report.
 #include "solver/cameras.h"
 #include "solver/commands/commands.h"
 #include "solver/panorama.h"
@@ -21,27 +23,49 @@
 #include <time.h>
 #include <unistd.h>
 
-enum { KEY_CAMERAS = 256, KEY_LIGHTS, KEY_PANORAMA, KEY_PROBE, KEY_PANELS, KEY_RADIUS, KEY_MESH, KEY_SIZE, KEY_SAMPLES,
-       KEY_NO_SHADOWS, KEY_THREADS, KEY_JSON };
-enum { MAX_PANELS = 4096, EXACT_SHADOWS_UP_TO = 1024, DEFAULT_SHADOW_RAYS = 2, MAX_SHADOW_RAYS = 256, MAX_BOUNCE_RAYS = 4096,
-       MAX_BOUNCE_TEXTURE = 4096 };
+enum {
+    KEY_CAMERAS = 256,
+    KEY_LIGHTS,
+    KEY_PANORAMA,
+    KEY_PROBE,
+    KEY_PANELS,
+    KEY_RADIUS,
+    KEY_MESH,
+    KEY_SIZE,
+    KEY_SAMPLES,
+    KEY_NO_SHADOWS,
+    KEY_THREADS,
+    KEY_JSON
+};
+enum {
+    MAX_PANELS = 4096,
+    EXACT_SHADOWS_UP_TO = 1024,
+    DEFAULT_SHADOW_RAYS = 2,
+    MAX_SHADOW_RAYS = 256,
+    MAX_BOUNCE_RAYS = 4096,
+    MAX_BOUNCE_TEXTURE = 4096
+};
 
 static const struct argp_option options[] = {
-    { "cameras", KEY_CAMERAS, "PATH", 0, "The views to render: a camera file or folder; required", 0 },
-    { "output", 'o', "DIR", 0, "Where <view>.exr and <view>.png go; required", 0 },
-    { "lights", KEY_LIGHTS, "FILE", 0, "Light it by this lights.json instead of SOLVE_DIR's", 1 },
-    { "panorama", KEY_PANORAMA, "FILE", 0, "Light it by this panorama (needs --world-from-probe)", 1 },
-    { "world-from-probe", KEY_PROBE, "FILE", 0, "JSON with the panorama's world_from_probe and centre_m", 1 },
-    { "lights-count", 'n', "N", 0, "Cut the panorama into N lights, a power of two (256)", 1 },
-    { "panels", KEY_PANELS, "FILE", 0, "JSON with the panels' corners: a light is as far as the panel its ray meets", 1 },
-    { "radius", KEY_RADIUS, "M", 0, "Metres to lights that meet no panel (3); inf: directional", 1 },
-    { "mesh", KEY_MESH, "FILE", 0, "Instead of the mesh that report.json names", 2 },
-    { "size", KEY_SIZE, "WxH", 0, "Pixels, instead of the cameras' own", 2 },
-    { "samples", KEY_SAMPLES, "N", 0, "Rays per pixel and side (2)", 2 },
-    { "no-shadows", KEY_NO_SHADOWS, 0, 0, "The object does not shadow itself", 2 },
-    { "threads", KEY_THREADS, "N", 0, "Default: all cores. The result does not depend on it", 2 },
-    { "json", KEY_JSON, 0, 0, "Print a summary as JSON", 2 },
-    { 0 },
+    {"cameras", KEY_CAMERAS, "PATH", 0, "The views to render: a camera file or folder; required",
+     0},
+    {"output", 'o', "DIR", 0, "Where <view>.exr and <view>.png go; required", 0},
+    {"lights", KEY_LIGHTS, "FILE", 0, "Light it by this lights.json instead of SOLVE_DIR's", 1},
+    {"panorama", KEY_PANORAMA, "FILE", 0, "Light it by this panorama (needs --world-from-probe)",
+     1},
+    {"world-from-probe", KEY_PROBE, "FILE", 0,
+     "JSON with the panorama's world_from_probe and centre_m", 1},
+    {"lights-count", 'n', "N", 0, "Cut the panorama into N lights, a power of two (256)", 1},
+    {"panels", KEY_PANELS, "FILE", 0,
+     "JSON with the panels' corners: a light is as far as the panel its ray meets", 1},
+    {"radius", KEY_RADIUS, "M", 0, "Metres to lights that meet no panel (3); inf: directional", 1},
+    {"mesh", KEY_MESH, "FILE", 0, "Instead of the mesh that report.json names", 2},
+    {"size", KEY_SIZE, "WxH", 0, "Pixels, instead of the cameras' own", 2},
+    {"samples", KEY_SAMPLES, "N", 0, "Rays per pixel and side (2)", 2},
+    {"no-shadows", KEY_NO_SHADOWS, 0, 0, "The object does not shadow itself", 2},
+    {"threads", KEY_THREADS, "N", 0, "Default: all cores. The result does not depend on it", 2},
+    {"json", KEY_JSON, 0, 0, "Print a summary as JSON", 2},
+    {0},
 };
 
 struct arguments {
@@ -51,12 +75,14 @@ struct arguments {
     bool no_shadows, json;
 };
 
-static int number(struct argp_state *state, const char *option, const char *text, long low, long high)
+static int number(struct argp_state *state, const char *option, const char *text, long low,
+                  long high)
 {
     char *end;
     const long value = strtol(text, &end, 10);
     if (end == text || *end || value < low || value > high)
-        argp_error(state, "%s %s: expected a whole number from %ld to %ld", option, text, low, high);
+        argp_error(state, "%s %s: expected a whole number from %ld to %ld", option, text, low,
+                   high);
     return (int)value;
 }
 
@@ -98,8 +124,8 @@ static error_t parse(int key, char *text, struct argp_state *state)
         a->mesh = text;
         return 0;
     case KEY_SIZE:
-        if (sscanf(text, "%5dx%5d%n", &a->width_px, &a->height_px, &n) != 2 || text[n] || a->width_px < 1 ||
-            a->height_px < 1 || a->width_px > 16384 || a->height_px > 16384)
+        if (sscanf(text, "%5dx%5d%n", &a->width_px, &a->height_px, &n) != 2 || text[n] ||
+            a->width_px < 1 || a->height_px < 1 || a->width_px > 16384 || a->height_px > 16384)
             argp_error(state, "--size %s: expected WxH, each from 1 to 16384", text);
         return 0;
     case KEY_SAMPLES:
@@ -137,14 +163,19 @@ static error_t parse(int key, char *text, struct argp_state *state)
 }
 
 static const struct argp argp = {
-    options, parse, "SOLVE_DIR --cameras PATH -o DIR",
+    options,
+    parse,
+    "SOLVE_DIR --cameras PATH -o DIR",
     "Re-render a solved material (or a synthetic studio's truth/) from given cameras.\v"
-    "Without --lights or --panorama it is lit by SOLVE_DIR/lights.json. Pictures are linear EXR (R, G, B, A as 32-bit floats, "
+    "Without --lights or --panorama it is lit by SOLVE_DIR/lights.json. Pictures are linear EXR "
+    "(R, G, B, A as 32-bit floats, "
     "not clipped) and PNG with the sRGB curve.",
-    0, 0, 0,
+    0,
+    0,
+    0,
 };
 
-// ---- what to render ---------------------------------------------------------------------------------------------------------
+// ---- what to render -----------------------------------------------------------------------------
 
 struct scene {
     struct json *report; // NULL: none
@@ -169,7 +200,8 @@ static void scene_free(struct scene *s)
 
 static int join(char path[PATH_MAX], const char *dir, const char *name)
 {
-    const int n = *name == '/' ? snprintf(path, PATH_MAX, "%s", name) : snprintf(path, PATH_MAX, "%s/%s", dir, name);
+    const int n = *name == '/' ? snprintf(path, PATH_MAX, "%s", name)
+                               : snprintf(path, PATH_MAX, "%s/%s", dir, name);
     if (n < PATH_MAX)
         return 0;
     log_error("render: the path %s/%s is too long", dir, name);
@@ -184,7 +216,8 @@ static int setting(const struct json *report, const char *key, int low, int high
         return otherwise;
     if (value >= low && value <= high)
         return (int)value;
-    log_warning("render: report.json: %s is %lld, expected %d to %d; %d is used", key, (long long)value, low, high, otherwise);
+    log_warning("render: report.json: %s is %lld, expected %d to %d; %d is used", key,
+                (long long)value, low, high, otherwise);
     return otherwise;
 }
 
@@ -217,7 +250,8 @@ static void choose_settings(struct scene *s, const struct arguments *a)
         .parameters = s->parameters.data ? &s->parameters : NULL,
         .nearest = nearest,
     };
-    if (r && !json_get_string(r, "variant", &variant) && !strcmp(variant, disney_variant_name(DISNEY_2012)))
+    if (r && !json_get_string(r, "variant", &variant) &&
+        !strcmp(variant, disney_variant_name(DISNEY_2012)))
         s->material.variant = DISNEY_2012;
 }
 
@@ -253,7 +287,8 @@ static int read_mesh(struct scene *s, const struct arguments *a)
     int err = 0;
     if (!name) {
         if (!s->report || json_get_string(s->report, "inputs.mesh", &name)) {
-            log_error("render: %s/report.json does not name a mesh (inputs.mesh); give --mesh", a->solve_dir);
+            log_error("render: %s/report.json does not name a mesh (inputs.mesh); give --mesh",
+                      a->solve_dir);
             return -ENOENT;
         }
         err = join(path, a->solve_dir, name);
@@ -267,7 +302,7 @@ static int read_mesh(struct scene *s, const struct arguments *a)
     return rays_new(&s->rays, &s->mesh);
 }
 
-// ---- light from a panorama --------------------------------------------------------------------------------------------------
+// ---- light from a panorama ----------------------------------------------------------------------
 
 static int read_probe(struct lights *l, const char *path)
 {
@@ -288,7 +323,9 @@ static int read_probe(struct lights *l, const char *path)
     for (int i = 0; i < 9; i++) {
         if (fabs(square[i] - (i % 4 == 0)) <= 1e-6 && mat3_det(R) > 0)
             continue;
-        log_error("render: %s: world_from_probe is not a rotation (rows orthonormal to 1e-6, determinant 1)", path);
+        log_error("render: %s: world_from_probe is not a rotation (rows orthonormal to 1e-6, "
+                  "determinant 1)",
+                  path);
         return -EINVAL;
     }
     memcpy(l->world_from_probe, R, sizeof(R));
@@ -309,7 +346,8 @@ static int read_panels(struct panel **out, int *n_out, const char *path)
     struct panel *panels = NULL;
     err = -EINVAL;
     if (n < 1 || n > MAX_PANELS) {
-        log_error("render: %s: 'panels' must be a list of 1 to %d panels with 'corners'", path, MAX_PANELS);
+        log_error("render: %s: 'panels' must be a list of 1 to %d panels with 'corners'", path,
+                  MAX_PANELS);
         goto done;
     }
     panels = calloc((size_t)n, sizeof(*panels));
@@ -353,7 +391,8 @@ static double meet_panel(const struct panel *p, const double from_m[3], const do
         at[k] = t * dir[k] - away[k];
     // at = a side0 + b side1
     const double uu = vec3_dot(p->side[0], p->side[0]), uv = vec3_dot(p->side[0], p->side[1]),
-                 vv = vec3_dot(p->side[1], p->side[1]), u = vec3_dot(at, p->side[0]), v = vec3_dot(at, p->side[1]);
+                 vv = vec3_dot(p->side[1], p->side[1]), u = vec3_dot(at, p->side[0]),
+                 v = vec3_dot(at, p->side[1]);
     const double det = uu * vv - uv * uv, a = (u * vv - v * uv) / det, b = (v * uu - u * uv) / det;
     return a >= 0 && a <= 1 && b >= 0 && b <= 1 ? t : INFINITY;
 }
@@ -421,7 +460,7 @@ static int read_scene(struct scene *s, const struct arguments *a)
     return err;
 }
 
-// ---- pictures ---------------------------------------------------------------------------------------------------------------
+// ---- pictures -----------------------------------------------------------------------------------
 
 static int render_one(const struct renderer *renderer, const struct camera *camera, const char *dir)
 {
@@ -467,8 +506,8 @@ static int print_summary(const struct scene *s, const struct arguments *a, doubl
 
 int command_render(int argc, char **argv)
 {
-    struct arguments a = { .radius_m = 3, .n_lights = 256 };
-    struct scene s = { 0 };
+    struct arguments a = {.radius_m = 3, .n_lights = 256};
+    struct scene s = {0};
     struct renderer *renderer = NULL;
     struct timespec start, end;
     argp_parse(&argp, argc, argv, 0, 0, &a);
@@ -485,8 +524,12 @@ int command_render(int argc, char **argv)
         progress_end();
     }
     clock_gettime(CLOCK_MONOTONIC, &end);
+    if (err == -ENOMEM)
+        log_error("render: out of memory");
     if (!err && a.json)
-        err = print_summary(&s, &a, (double)(end.tv_sec - start.tv_sec) + 1e-9 * (double)(end.tv_nsec - start.tv_nsec));
+        err = print_summary(&s, &a,
+                            (double)(end.tv_sec - start.tv_sec) +
+                                1e-9 * (double)(end.tv_nsec - start.tv_nsec));
     renderer_free(renderer);
     scene_free(&s);
     return err ? EXIT_FAILED : EXIT_DONE;
