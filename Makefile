@@ -114,10 +114,11 @@ fuzz: deps deps-fuzz $(FUZZ_PROGRAMS)
 demo: deps $(BUILD)/bin/rigsolve
 	@BIN=$(BUILD)/bin sh tests/demo.sh build/demo
 
-BENCH_PROGRAMS := $(patsubst tests/bench/%.c,$(BUILD)/tests/bench/%,$(call have,$(wildcard tests/bench/*.c)))
+BENCHES := kernels rays synth
+BENCH_PROGRAMS := $(addprefix $(BUILD)/tests/bench/bench_,$(BENCHES))
 $(BUILD)/tests/bench/bench_kernels: $(if $(wildcard /usr/include/ceres/jet.h),$(BUILD)/obj/tests/bench/ceres_peer.o)
 bench: deps $(BENCH_PROGRAMS) $(BUILD)/bin/rigsolve
-	@for b in kernels rays synth; do echo "== bench_$$b"; $(BUILD)/tests/bench/bench_$$b || exit 1; done
+	@for b in $(BENCHES); do echo "== bench_$$b"; $(BUILD)/tests/bench/bench_$$b || exit 1; done
 chart: deps deps-bench $(BUILD)/tests/bench/chart_lights
 	@mkdir -p build/chart && $(BUILD)/tests/bench/chart_lights >build/chart/lights.csv && gnuplot -e "out='build/chart/lights'" tests/bench/chart_lights.gp
 	@echo "chart: build/chart/lights.csv .svg .png: seconds against error over N, roughness and kernel"
