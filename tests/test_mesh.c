@@ -304,10 +304,11 @@ static void make_cube(struct mesh *m, bool broken_normals)
             uv[4 * face + k][0] = (float)((face % 3 + .1 + .8 * a) / 3);
             uv[4 * face + k][1] = (float)((face / 3 + .1 + .8 * b) / 2);
         }
+        const uint32_t from = face == 0 || face == 3; // which diagonal: uneven, so that corners have 3 to 6 triangles
         for (uint32_t k = 0; k < 2; k++) {
-            triangle[2 * face + (int)k][0] = 4 * (uint32_t)face;
-            triangle[2 * face + (int)k][1] = 4 * (uint32_t)face + 1 + k;
-            triangle[2 * face + (int)k][2] = 4 * (uint32_t)face + 2 + k;
+            triangle[2 * face + (int)k][0] = 4 * (uint32_t)face + from;
+            triangle[2 * face + (int)k][1] = 4 * (uint32_t)face + from + 1 + k;
+            triangle[2 * face + (int)k][2] = 4 * (uint32_t)face + (from + 2 + k) % 4;
         }
     }
     for (int i = 0; i < 24 && broken_normals; i++)
@@ -565,6 +566,8 @@ static void broken_glbs_are_refused_with_their_place(void **state)
     assert_int_equal(read_bytes(&m, NULL, "broken.glb", bytes, n), -EINVAL);
     assert_non_null(strstr(errors, "1 of 2 triangles use vertices that do not exist"));
     make_glb(bytes, GLTF(ONE_NODE, "", ""));
+    assert_int_equal(read_bytes(&m, NULL, "broken.glb", bytes, n + 4), -EINVAL);
+    assert_non_null(strstr(errors, "the header says"));
     bytes[4] = 1;
     assert_int_equal(read_bytes(&m, NULL, "broken.glb", bytes, n), -ENOTSUP);
     assert_non_null(strstr(errors, "version 1"));
