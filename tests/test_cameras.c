@@ -641,8 +641,8 @@ static void files_of_real_tools_are_read_or_refused(void **state)
             n_seen++;
         }
     }
-    fprintf(stderr, "test_cameras: COLMAP text against binary: %.3g px with 17 digits, %.3g px as shipped with 6 digits, %d points\n",
-            most, by_hand, n_seen);
+    fprintf(stderr, "test_cameras: COLMAP text against binary: %.3g px with 17 digits, %.3g px as shipped with 6 digits, "
+            "%d points\n", most, by_hand, n_seen);
     assert_int_equal(n_seen, 11000);
     assert_true(most < 1e-6);
     assert_true(by_hand < .1); // half a unit in the 6th digit of every number

@@ -347,8 +347,8 @@ static void seams_are_no_creases(void **state)
 static void charts_join_where_edges_meet_in_space_and_atlas(void **state)
 {
     (void)state;
-    // Four triangles in a row. 0-1 share an edge and its UVs; 1-2 share the edge, but not the UVs; 2-3 the UVs (and normals differ),
-    // so that vertices are split and the chart is not.
+    // Four triangles in a row. 0-1 share an edge and its UVs; 1-2 share the edge, but not the UVs; 2-3 the UVs, but not the
+    // normals, so that vertices are split and the chart is not.
     const char *obj = "v 0 0 0\nv 1 0 0\nv 0 1 0\nv 1 1 0\nv 1 2 0\nv 0 2 0\n"
                       "vt 0 0\nvt .2 0\nvt 0 .2\nvt .2 .2\nvt .5 0\nvt .7 0\nvt .7 .2\nvt .5 .2\nvn 0 0 1\nvn 0 1 0\n"
                       "f 1/1 2/2 3/3\nf 2/2 4/4 3/3\nf 3/5/1 4/6/1 5/7/1\nf 3/5/2 5/7/2 6/8/2\n";
