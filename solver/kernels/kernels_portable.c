@@ -110,5 +110,5 @@ V void add_up(const vf *x, int n, float *sums)
 #include "solver/kernels/kernels_body.h"
 
 const struct kernels kernels_portable_table = {
-    "portable", gather, shade, shade_jacobian, brute_jacobian, irradiance,
+    "portable", gather, shade, shade_jacobian, brute_jacobian, irradiance, shade_jacobian_views,
 };
