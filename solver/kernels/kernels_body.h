@@ -433,62 +433,49 @@ struct incoming {
     vf lx, ly, nl, weight, lx_rest, ly_rest;
 };
 
-// nl stays above 0 so that nothing divides by 0, whatever the weight.
-INLINE void weigh(struct incoming *in, vf ud, vf iu)
+INLINE vf v_dot(const vf u[3], const float a[3])
 {
-    in->weight = v_max(in->nl, v_set1(0)) * v_max(ud, v_set1(0)) * (iu * iu * iu);
-    in->nl = v_max(in->nl, v_set1(1e-10f));
+    return v_fma(u[0], v_set1(a[0]), v_fma(u[1], v_set1(a[1]), u[2] * v_set1(a[2])));
 }
 
-INLINE struct incoming light_at(const struct light_arrays *a, int i, const struct surface_point *s)
+INLINE vd d_dot(const vd u[3], const float a[3])
 {
-    const vf q = v_load(a->q + i);
-    vf d[3], u[3];
-    for (int c = 0; c < 3; c++) {
-        d[c] = v_load((c == 0 ? a->dx : c == 1 ? a->dy : a->dz) + i);
-        u[c] = v_fma(q, v_set1(a->centre_m[c] - s->position_m[c]), d[c]);
-    }
-    vf unused;
-    const vf iu = v_rsqrt_sqrt(v_max(v_fma(u[0], u[0], v_fma(u[1], u[1], u[2] * u[2])), v_set1(1e-12f)), &unused);
-    const float *const x = s->tangent, *const y = s->bitangent, *const n = s->normal;
+    return d_fma(u[0], d_set1((double)a[0]), d_fma(u[1], d_set1((double)a[1]), u[2] * d_set1((double)a[2])));
+}
+
+// exact: lx and ly in double, half a vector at a time, kept as float + float.
+INLINE struct incoming light_at(const struct light_arrays *a, int i, const struct surface_point *s, bool exact)
+{
     struct incoming in;
-    in.lx = iu * v_fma(u[0], v_set1(x[0]), v_fma(u[1], v_set1(x[1]), u[2] * v_set1(x[2])));
-    in.ly = iu * v_fma(u[0], v_set1(y[0]), v_fma(u[1], v_set1(y[1]), u[2] * v_set1(y[2])));
-    in.nl = iu * v_fma(u[0], v_set1(n[0]), v_fma(u[1], v_set1(n[1]), u[2] * v_set1(n[2])));
-    weigh(&in, v_fma(u[0], d[0], v_fma(u[1], d[1], u[2] * d[2])), iu);
-    return in;
-}
-
-// The same in double, half a vector at a time.
-INLINE struct incoming light_at_exact(const struct light_arrays *a, int i, const struct surface_point *s)
-{
-    vd lx[2], ly[2], nl[2], ud[2], iu[2];
-    for (int half = 0; half < 2; half++) {
-        const vd q = d_wide(v_load(a->q + i), half);
-        vd d[3], u[3];
-        for (int c = 0; c < 3; c++) {
-            d[c] = d_wide(v_load((c == 0 ? a->dx : c == 1 ? a->dy : a->dz) + i), half);
-            u[c] = d_fma(q, d_set1((double)a->centre_m[c] - (double)s->position_m[c]), d[c]);
+    const vf q = v_load(a->q + i), d[3] = { v_load(a->dx + i), v_load(a->dy + i), v_load(a->dz + i) };
+    vf u[3], unused;
+    for (int c = 0; c < 3; c++)
+        u[c] = v_fma(q, v_set1(a->centre_m[c] - s->position_m[c]), d[c]);
+    const vf u2 = v_max(v_fma(u[0], u[0], v_fma(u[1], u[1], u[2] * u[2])), v_set1(1e-12f));
+    const vf ud = v_max(v_fma(u[0], d[0], v_fma(u[1], d[1], u[2] * d[2])), v_set1(0));
+    const vf iu = v_rsqrt_sqrt(u2, &unused);
+    if (exact) {
+        vd lx[2], ly[2];
+        for (int half = 0; half < 2; half++) {
+            const vd q_half = d_wide(q, half), y = d_wide(iu, half);
+            vd w[3];
+            for (int c = 0; c < 3; c++)
+                w[c] = d_fma(q_half, d_set1((double)a->centre_m[c] - (double)s->position_m[c]), d_wide(d[c], half));
+            const vd w2 = d_fma(w[0], w[0], d_fma(w[1], w[1], w[2] * w[2]));
+            // One Newton step takes 1e-7 to 1e-14.
+            const vd iw = d_fma(y * d_set1(.5), d_fnma(w2 * y, y, d_set1(1)), y);
+            lx[half] = iw * d_dot(w, s->tangent), ly[half] = iw * d_dot(w, s->bitangent);
         }
-        const vd u2 = d_fma(u[0], u[0], d_fma(u[1], u[1], u[2] * u[2]));
-        ud[half] = d_fma(u[0], d[0], d_fma(u[1], d[1], u[2] * d[2]));
-        iu[half] = u2;
-        const float *const x = s->tangent, *const y = s->bitangent, *const n = s->normal;
-        lx[half] = d_fma(u[0], d_set1((double)x[0]), d_fma(u[1], d_set1((double)x[1]), u[2] * d_set1((double)x[2])));
-        ly[half] = d_fma(u[0], d_set1((double)y[0]), d_fma(u[1], d_set1((double)y[1]), u[2] * d_set1((double)y[2])));
-        nl[half] = d_fma(u[0], d_set1((double)n[0]), d_fma(u[1], d_set1((double)n[1]), u[2] * d_set1((double)n[2])));
+        in.lx = d_narrow(lx[0], lx[1]), in.ly = d_narrow(ly[0], ly[1]);
+        in.lx_rest = d_narrow(lx[0] - d_wide(in.lx, 0), lx[1] - d_wide(in.lx, 1));
+        in.ly_rest = d_narrow(ly[0] - d_wide(in.ly, 0), ly[1] - d_wide(in.ly, 1));
+    } else {
+        in.lx = iu * v_dot(u, s->tangent), in.ly = iu * v_dot(u, s->bitangent);
+        in.lx_rest = in.ly_rest = v_set1(0);
     }
-    vf unused;
-    const vf start = v_rsqrt_sqrt(v_max(d_narrow(iu[0], iu[1]), v_set1(1e-12f)), &unused);
-    for (int half = 0; half < 2; half++) { // one Newton step takes 1e-7 to 1e-14
-        const vd y = d_wide(start, half), e = d_fnma(iu[half] * y, y, d_set1(1));
-        iu[half] = d_fma(y * d_set1(.5), e, y);
-        lx[half] *= iu[half], ly[half] *= iu[half], nl[half] *= iu[half];
-    }
-    struct incoming in = { .lx = d_narrow(lx[0], lx[1]), .ly = d_narrow(ly[0], ly[1]), .nl = d_narrow(nl[0], nl[1]) };
-    in.lx_rest = d_narrow(lx[0] - d_wide(in.lx, 0), lx[1] - d_wide(in.lx, 1));
-    in.ly_rest = d_narrow(ly[0] - d_wide(in.ly, 0), ly[1] - d_wide(in.ly, 1));
-    weigh(&in, d_narrow(ud[0], ud[1]), d_narrow(iu[0], iu[1]));
+    const vf nl = iu * v_dot(u, s->normal);
+    in.weight = v_max(nl, v_set1(0)) * ud * (iu * iu * iu);
+    in.nl = v_max(nl, v_set1(1e-10f)); // so that nothing divides by 0, whatever the weight
     return in;
 }
 
@@ -502,7 +489,7 @@ static void gather(struct lit *out, const struct light_arrays *a, const struct s
 {
     int n = 0;
     for (int i = 0; i < a->n_padded; i += LANES) {
-        struct incoming in = light_at_exact(a, i, s);
+        struct incoming in = light_at(a, i, s, true);
         if (soft)
             in.weight = in.weight * v_bytes(soft + i, a->n - i) * v_set1(1 / 255.f);
         // weight > 0 holds for lights above the horizon that face the point, and for no padding.
@@ -536,10 +523,8 @@ INLINE void brute_all(struct sums *sums, const struct light_arrays *a, const str
         vf sum[N_SUMS][3];
         clear_sums(sum);
         for (int i = begin; i < end; i += LANES) {
-            const struct incoming in = sharp ? light_at_exact(a, i, s) : light_at(a, i, s);
-            struct light_vector l = { .lx = in.lx, .ly = in.ly, .nl = in.nl };
-            if (sharp)
-                l.lx_rest = in.lx_rest, l.ly_rest = in.ly_rest;
+            const struct incoming in = light_at(a, i, s, sharp);
+            struct light_vector l = { .lx = in.lx, .ly = in.ly, .nl = in.nl, .lx_rest = in.lx_rest, .ly_rest = in.ly_rest };
             l.sl = v_schlick(l.nl), l.gc = v_coat_g(l.nl);
             l.w[0] = in.weight * v_load(a->cr + i), l.w[1] = in.weight * v_load(a->cg + i);
             l.w[2] = in.weight * v_load(a->cb + i);
@@ -574,7 +559,7 @@ static void irradiance(float E[3], const struct light_arrays *a, const struct su
         const int end = a->n_padded - begin < BLOCK ? a->n_padded : begin + BLOCK;
         vf sum[3] = { v_set1(0), v_set1(0), v_set1(0) };
         for (int i = begin; i < end; i += LANES) {
-            const vf w = v_keep(light_at(a, i, s).weight, visible_bits(visible, i));
+            const vf w = v_keep(light_at(a, i, s, false).weight, visible_bits(visible, i));
             sum[0] = v_fma(w, v_load(a->cr + i), sum[0]);
             sum[1] = v_fma(w, v_load(a->cg + i), sum[1]);
             sum[2] = v_fma(w, v_load(a->cb + i), sum[2]);
