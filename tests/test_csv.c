@@ -1,7 +1,5 @@
-// tests/test_csv.c - tables are read by column name, and what is wrong is named with line and column; also through rigsolve brdf.
-#include "solver/commands/commands.h"
+// tests/test_csv.c - tables are read by column name, and what is wrong is named with line and column.
 #include "solver/csv.h"
-#include "solver/disney.h"
 #include "solver/take/log.h"
 
 #include <errno.h>
@@ -136,85 +134,6 @@ static void commas_of_the_locale_change_nothing(void **state)
     setlocale(LC_ALL, "C");
 }
 
-static const char case_header[] = "n_x,n_y,n_z,tx_x,tx_y,tx_z,ty_x,ty_y,ty_z,v_x,v_y,v_z,l_x,l_y,l_z,albedo_r,albedo_g,albedo_b,metallic,"
-                                  "subsurface,specular,roughness,specularTint,anisotropic,sheen,sheenTint,clearcoat,clearcoatGloss";
-static const char good_case[] = "0,0,1,1,0,0,0,1,0,0,0,1,0,0,1,.5,.5,.5,0,0,.5,.5,0,0,0,0,0,0";
-
-static void bad_cases_are_named(void **state)
-{
-    (void)state;
-    static const struct {
-        const char *row, *said;
-    } bad[] = {
-        { "0,0,1,1,0,0,0,1,0,0,0,1,0,0,1,.5,.5,.5,0,0,.5,1.01,0,0,0,0,0,0", ":3: column 'roughness': found 1.01" },
-        { "0,0,1,1,0,0,0,1,0,0,0,1,0,0,1,.5,.5,.5,0,0,.5,.5,0,0,0,0,0,-.1", ":3: column 'clearcoatGloss': found -0.1" },
-        { "0,0,1,1,0,0,0,1,0,0,0,1,0,0,1,.5,-.5,.5,0,0,.5,.5,0,0,0,0,0,0", ":3: column 'albedo_g': found -0.5" },
-        { "0,0,1,1,0,0,0,1,0,0,0,2,0,0,1,.5,.5,.5,0,0,.5,.5,0,0,0,0,0,0", ":3: columns 'v_x' to 'v_z': a vector of length 2" },
-        { "0,0,1,1,0,0,0,1,0,0,0,1,0,0,0,.5,.5,.5,0,0,.5,.5,0,0,0,0,0,0", ":3: columns 'l_x' to 'l_z': a vector of length 0" },
-        { "0,0,1,.6,0,.8,0,1,0,0,0,1,0,0,1,.5,.5,.5,0,0,.5,.5,0,0,0,0,0,0", ":3: columns 'n_x' and 'tx_x'" },
-        { "0,0,one,1,0,0,0,1,0,0,0,1,0,0,1,.5,.5,.5,0,0,.5,.5,0,0,0,0,0,0", ":3: column 'n_z': found 'one'" },
-        { "0,0,1,1,0,0,0,1,0,0,0,1,0,0,1", ":3: found 15 fields, expected 28" },
-    };
-    char dir[] = "/tmp/studiorig-test-XXXXXX", path[64], out[64];
-    assert_non_null(mkdtemp(dir));
-    snprintf(path, sizeof(path), "%s/cases.csv", dir);
-    snprintf(out, sizeof(out), "%s/out.csv", dir);
-    char *arguments[] = { (char[]){ "rigsolve brdf" }, path, (char[]){ "-o" }, out, NULL };
-    for (size_t i = 0; i <= sizeof(bad) / sizeof(bad[0]); i++) {
-        const int is_good = i == sizeof(bad) / sizeof(bad[0]);
-        FILE *f = fopen(path, "w");
-        assert_non_null(f);
-        fprintf(f, "%s\n%s\n%s\n", case_header, good_case, is_good ? good_case : bad[i].row);
-        fclose(f);
-        message[0] = 0;
-        assert_int_equal(command_brdf(4, arguments), is_good ? EXIT_DONE : EXIT_FAILED);
-        if (!is_good)
-            assert_said(bad[i].said);
-        f = fopen(out, "r");
-        assert_true((f != NULL) == is_good); // nothing half-written
-        if (f)
-            fclose(f);
-    }
-    remove(path), remove(out), remove(dir);
-}
-
-static void printed_tables_are_read_back_as_they_were(void **state)
-{
-    (void)state;
-    char dir[] = "/tmp/studiorig-test-XXXXXX", path[64], out[64];
-    assert_non_null(mkdtemp(dir));
-    snprintf(path, sizeof(path), "%s/cases.csv", dir);
-    snprintf(out, sizeof(out), "%s/out.csv", dir);
-    FILE *f = fopen(path, "w");
-    assert_non_null(f);
-    fprintf(f, "%s\n%s\n", case_header, good_case);
-    fclose(f);
-    for (int which = 0; which < 2; which++) {
-        char *arguments[] = { (char[]){ "rigsolve brdf" }, path, (char[]){ "-o" }, out, (char[]){ "--kernel" },
-                              which ? (char[]){ "portable" } : (char[]){ "reference" }, NULL };
-        assert_int_equal(command_brdf(6, arguments), EXIT_DONE);
-        struct csv c;
-        double value;
-        assert_int_equal(csv_open(&c, out), 0);
-        assert_int_equal(c.n_columns, which ? 42 : 60);
-        assert_int_equal(csv_find(&c, "f_r"), 0);
-        assert_int_equal(csv_find(&c, "df_b_dalbedo_b"), 41);
-        assert_int_equal(csv_find(&c, "df_g_dclearcoatGloss"), 3 + 19);
-        assert_true((csv_find(&c, "df_r_dl_x") == 42) == !which);
-        assert_int_equal(csv_next_row(&c), 1);
-        assert_int_equal(csv_number(&c, 0, &value), 0);
-        const struct disney m = { .theta = { [DISNEY_SPECULAR] = .5, [DISNEY_ROUGHNESS] = .5 }, .albedo = { .5, .5, .5 } };
-        const struct disney_frame frame = { .n = { 0, 0, 1 }, .x = { 1, 0, 0 }, .y = { 0, 1, 0 } };
-        const double up[3] = { 0, 0, 1 };
-        double want[3];
-        disney_eval(&m, &frame, up, up, want);
-        assert_true(which ? value > want[0] * (1 - 1e-6) && value < want[0] * (1 + 1e-6) : value == want[0]);
-        assert_int_equal(csv_next_row(&c), 0);
-        csv_close(&c);
-    }
-    remove(path), remove(out), remove(dir);
-}
-
 int main(void)
 {
     const struct CMUnitTest tests[] = {
@@ -223,8 +142,6 @@ int main(void)
         cmocka_unit_test(what_is_no_number_is_refused),
         cmocka_unit_test(files_that_are_no_tables_are_refused),
         cmocka_unit_test(commas_of_the_locale_change_nothing),
-        cmocka_unit_test(bad_cases_are_named),
-        cmocka_unit_test(printed_tables_are_read_back_as_they_were),
     };
     return cmocka_run_group_tests(tests, set_up, NULL);
 }
