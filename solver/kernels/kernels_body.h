@@ -1,7 +1,7 @@
 // solver/kernels/kernels_body.h - the float kernels, written once over a vector type; each instruction set's file defines
 //   vf, LANES floats (LANES divides KERNEL_WIDTH), and vd, half as many doubles;
-//   v_set1 v_load v_store v_max v_fma(a,b,c) = ab+c, v_fnma = c-ab, v_rcp, v_rsqrt_sqrt (returns 1/sqrt, stores sqrt);
-//   v_mask: v_positive(x, bits) v_count v_compress; v_keep v_bytes add_up; d_set1 d_fma d_fnma d_wide(x, half) d_narrow(a, b)
+//   v_set1 v_load v_store v_max v_fma(a,b,c) = ab+c, v_rcp, v_rsqrt_sqrt (returns 1/sqrt, stores sqrt);
+//   v_mask: v_positive(x, bits) v_count v_compress; v_keep v_bytes add_up; d_set1 d_fma d_fnma(a,b,c) = c-ab d_wide(x, half) d_narrow(a, b)
 // and includes this file.
 //
 // Light and view directions are in the surface's own frame (x, y, n), where the horizon is a sign and alpha is diagonal.

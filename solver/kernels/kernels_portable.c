@@ -27,10 +27,6 @@ V vf v_fma(vf a, vf b, vf c)
 {
     return a * b + c;
 }
-V vf v_fnma(vf a, vf b, vf c)
-{
-    return c - a * b;
-}
 V vf v_max(vf a, vf b)
 {
     const vi more = a > b;
