@@ -4,7 +4,7 @@
 #include "solver/random.h"
 #include "solver/take/log.h"
 #include "solver/vec3.h"
-#include "solver/whole_file.h"
+#include "solver/take/atomic_file.h"
 
 #include <dirent.h>
 #include <errno.h>
@@ -495,7 +495,7 @@ static void cut_files_never_give_other_cameras(void **state)
         struct cameras whole;
         assert_int_equal((binary ? cameras_write_colmap_binary : cameras_write_colmap_text)(&c, dir), 0);
         for (int k = 0; k < 2; k++)
-            assert_int_equal(whole_file_read(&bytes[k], &n[k], in_dir(names[binary][k]), 1 << 20), 0);
+            assert_int_equal(file_read(&bytes[k], &n[k], in_dir(names[binary][k]), 1 << 20), 0);
         assert_int_equal(cameras_read(&whole, dir), 0);
         for (int k = 0; k < 2; k++)
             for (size_t cut = 0; cut < n[k]; cut++) {
@@ -535,8 +535,8 @@ static void absurd_counts_are_refused_before_memory_is_asked_for(void **state)
     char *bytes[2] = { NULL, NULL };
     size_t n[2] = { 0, 0 };
     assert_int_equal(cameras_write_colmap_binary(&c, dir), 0);
-    assert_int_equal(whole_file_read(&bytes[0], &n[0], in_dir("cameras.bin"), 1 << 20), 0);
-    assert_int_equal(whole_file_read(&bytes[1], &n[1], in_dir("images.bin"), 1 << 20), 0);
+    assert_int_equal(file_read(&bytes[0], &n[0], in_dir("cameras.bin"), 1 << 20), 0);
+    assert_int_equal(file_read(&bytes[1], &n[1], in_dir("images.bin"), 1 << 20), 0);
     for (size_t i = 0; i < sizeof(counts) / sizeof(counts[0]); i++)
         for (int place = 0; place < 3; place++) { // cameras, images, points of the image
             char *copy[2] = { malloc(n[0]), malloc(n[1]) };

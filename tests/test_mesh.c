@@ -2,7 +2,7 @@
 #include "solver/mesh.h"
 #include "solver/take/log.h"
 #include "solver/vec3.h"
-#include "solver/whole_file.h"
+#include "solver/take/atomic_file.h"
 
 #include <dirent.h>
 #include <errno.h>

@@ -12,7 +12,7 @@
 
 static void check_file(const uint8_t *bytes, size_t n)
 {
-    char *copy = malloc(n + 1); // as whole_file_read() leaves it
+    char *copy = malloc(n + 1); // as file_read() leaves it
     int format;
     memcpy(copy, bytes, n);
     copy[n] = 0;
