@@ -252,8 +252,11 @@ int main(int argc, char **argv)
                    "\"times_ceres_careful\":%.6g}", n++ ? "," : "", m->kernel, m->what, m->median, m->seconds[0],
                    m->seconds[N_ROUNDS - 1], plain / m->median, careful / m->median);
         else
-            printf("%-10s %-26s %10.5f %10.5f %10.5f %14.1f %14.1f\n", m->kernel, m->what, m->median, m->seconds[0],
-                   m->seconds[N_ROUNDS - 1], plain / m->median, careful / m->median);
+            printf("%-10s %-26s %10.5f %10.5f %10.5f", m->kernel, m->what, m->median, m->seconds[0], m->seconds[N_ROUNDS - 1]);
+        if (!json && ceres_peer_jacobian)
+            printf(" %14.1f %14.1f", plain / m->median, careful / m->median);
+        if (!json)
+            putchar('\n');
     }
     if (json)
         puts("]}");
