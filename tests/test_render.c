@@ -596,7 +596,7 @@ static double shaded_once_error(const struct mesh *mesh, const struct lights *li
     return sqrt(squares / n) / white;
 }
 
-static void one_shading_per_smooth_pixel_is_second_order_in_its_size(void **state)
+static void one_shading_per_smooth_pixel_costs_less_than_the_solver_aims_at(void **state)
 {
     (void)state;
     struct mesh mesh;
@@ -607,7 +607,8 @@ static void one_shading_per_smooth_pixel_is_second_order_in_its_size(void **stat
                  fine = shaded_once_error(&mesh, &lights, 100);
     fprintf(stderr, "# shaded once: RMSE %.4f%% at 50 px, %.4f%% at 100 px\n", 100 * coarse,
             100 * fine);
-    assert_true(coarse < .005 && fine < coarse / 2.8); // 2^1.5: well above first order
+    // SOLVER.md 5's tightest target is an RMSE of .08%; real views have 5 times the pixels.
+    assert_true(coarse < .0008 && fine < .0008);
     lights_free(&lights), mesh_free(&mesh);
 }
 
@@ -741,7 +742,7 @@ int main(void)
         cmocka_unit_test(a_bowl_brightens_inside_and_makes_no_energy),
         cmocka_unit_test(textures_lie_upright_and_nearest_keeps_borders_sharp),
         cmocka_unit_test(silhouettes_carry_the_share_they_cover),
-        cmocka_unit_test(one_shading_per_smooth_pixel_is_second_order_in_its_size),
+        cmocka_unit_test(one_shading_per_smooth_pixel_costs_less_than_the_solver_aims_at),
         cmocka_unit_test(threads_do_not_change_a_bit_and_seeds_do),
         cmocka_unit_test(extreme_materials_and_lights_give_finite_pixels),
         cmocka_unit_test(a_mesh_without_area_in_uv_or_normals_still_renders),
