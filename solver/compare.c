@@ -62,8 +62,9 @@ int compare_images(struct comparison *out, const struct image *a, const struct i
                 const double va = a->data[i * a->n_channels + at_a[c]];
                 const double vb = b->data[i * b->n_channels + at_b[c]];
                 if (!isfinite(va) || !isfinite(vb)) {
-                    log_error("compare: pixel %d,%d of the %s picture is not finite (channel %c)",
-                              x, y, isfinite(va) ? "second" : "first", "RGB"[c]);
+                    log_error(
+                        "compare: column %d, row %d of the %s picture is not finite (channel %c)",
+                        x, y, isfinite(va) ? "second" : "first", "RGB"[c]);
                     return -EDOM;
                 }
                 const double d = va - vb, d_clipped = clip(va) - clip(vb);

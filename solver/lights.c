@@ -1,8 +1,8 @@
 // solver/lights.c - cutting a panorama into lights, their irradiance at a point with derivatives,
 // and lights.json.
 //
-// Letters (paper, Eqs. 1-4): dh probe direction, C irradiance, c centre, R world_from_probe, q =
-// 1/r.
+// Letters (paper, Eqs. 1-4): dh probe direction, C irradiance, c centre, R world_from_probe, and
+// q = 1/r. All others: NOTATION.md.
 #include "solver/lights.h"
 #include "solver/take/log.h"
 #include "solver/vec3.h"
@@ -14,8 +14,7 @@
 #include <stdlib.h>
 #include <string.h>
 
-// ---- memory
-// -------------------------------------------------------------------------------------------------------------
+// ---- memory -------------------------------------------------------------------------------------
 
 int lights_new(struct lights *out, int n)
 {
@@ -52,8 +51,7 @@ void lights_free(struct lights *l)
     memset(l, 0, sizeof(*l));
 }
 
-// ---- one light at one point (Eqs. 1-4)
-// ----------------------------------------------------------------------------------
+// ---- one light at one point (Eqs. 1-4) ----------------------------------------------------------
 //
 //   a = R dh,  u = a + q (c - p),  s = |u|,  l = u / s,  weight = max(<u, a>, 0) / s^3
 //
@@ -94,8 +92,8 @@ void light_at_point(const struct lights *l, int i, const double point_m[3], stru
 
 // By the chain rule over u and a, with m = <u, a>:
 //   dl/du = (I - l l^T)/s,  dweight/du = a/s^3 - 3 m u/s^5,  dweight/da = u/s^3
-//   du/dc = q I,  du/dp = -q I,  du/dq = c - p,  da/dw = du/dw = -[a]x  (R = exp([w]x) R0, so a
-//   moves by w x a)
+//   du/dc = q I,  du/dp = -q I,  du/dq = c - p
+//   da/dw = du/dw = -[a]x, for R = exp([w]x) R0 moves a by w x a
 void light_at_point_gradient(const struct lights *l, int i, const double point_m[3],
                              struct light_at_gradient *out)
 {
@@ -127,15 +125,14 @@ void light_at_point_gradient(const struct lights *l, int i, const double point_m
     out->weight_inverse_distance = vec3_dot(weight_u, c_minus_p);
 }
 
-// ---- median cut
-// ---------------------------------------------------------------------------------------------------------
+// ---- median cut ---------------------------------------------------------------------------------
 
 struct cutter {
     const struct panorama *p;
     int width, height;
     double *sin_lon, *cos_lon;         // [width] of pixel centres
     double *sin_lat, *cos_lat, *omega; // [height]; omega: solid angle of the row's pixels
-    double *along; // [max(width, height)] energy of each column or row of one region
+    double *along;                     // [width] energy of each column or row of one region
     struct lights *out;
 };
 
@@ -205,8 +202,8 @@ static bool split(const struct cutter *k, const struct light_region *r, struct l
     return true;
 }
 
-static double angle_between(const double a[3],
-                            const double b[3]) // of unit vectors; exact for small angles
+// Of unit vectors; exact for small angles.
+static double angle_between(const double a[3], const double b[3])
 {
     const double d[3] = {a[0] - b[0], a[1] - b[1], a[2] - b[2]};
     return 2 * asin(fmin(vec3_norm(d) / 2, 1));
@@ -278,14 +275,13 @@ int lights_median_cut(struct lights *out, const struct panorama *p, int n)
     struct lights l = {0};
     memset(out, 0, sizeof(*out));
     if (n < 1 || n > LIGHTS_MAX || (n & (n - 1))) {
-        log_error(
-            "lights: cannot cut a panorama into %d lights: expected a power of two from 1 to %d", n,
-            LIGHTS_MAX);
+        log_error("lights: cannot cut a panorama into %d lights: expected a power of two from 1 "
+                  "to %d",
+                  n, LIGHTS_MAX);
         return -EINVAL;
     }
     int err = lights_new(&l, n);
-    double *tables = malloc(((size_t)width * 3 + (size_t)height * 3) *
-                            sizeof(double)); // along: max(width, height) = width
+    double *tables = malloc(((size_t)width * 3 + (size_t)height * 3) * sizeof(double));
     if (err || !tables)
         goto no_memory;
     l.region = calloc((size_t)n, sizeof(*l.region));
@@ -324,8 +320,7 @@ no_memory:
     return -ENOMEM;
 }
 
-// ---- lights.json
-// --------------------------------------------------------------------------------------------------------
+// ---- lights.json --------------------------------------------------------------------------------
 
 static const char format_name[] = "studiorig-lights-1";
 
@@ -390,9 +385,12 @@ static bool is_null(const struct json *doc, const char *key)
     return null;
 }
 
-static int refuse(const char *file, const char *key, const char *what)
+static int refuse(const char *file, const struct json *doc, const char *key, const char *what)
 {
-    log_error("lights: %s: %s %s", file, key, what);
+    char *found = json_text(json_get(doc, key));
+    log_error("lights: %s: %s: found %.80s%s: %s", file, key, found ? found : "?",
+              found && strlen(found) > 80 ? "..." : "", what);
+    free(found);
     return -EINVAL;
 }
 
@@ -412,15 +410,15 @@ static int read_place(struct lights *l, const struct json *doc, const char *file
         return err;
     for (int k = 0; k < 3; k++)
         if (!(fabs(l->centre_m[k]) <= length_max_m))
-            return refuse(file, "centre_m", "is more than 1e9 m away: expected metres");
+            return refuse(file, doc, "centre_m", "more than 1e9 m away; expected metres");
     const double *R = l->world_from_probe;
     for (int i = 0; i < 3; i++)
         for (int j = i; j < 3; j++)
             if (!(fabs(vec3_dot(R + 3 * i, R + 3 * j) - (i == j)) <= 1e-6))
-                return refuse(file, "world_from_probe",
-                              "is not a rotation: its rows are not orthonormal to 1e-6");
+                return refuse(file, doc, "world_from_probe",
+                              "not a rotation: its rows are not orthonormal to 1e-6");
     if (mat3_det(R) < 0)
-        return refuse(file, "world_from_probe",
+        return refuse(file, doc, "world_from_probe",
                       "is mirrored (determinant -1): expected a rotation; mirror the panorama, "
                       "not the rotation");
     return 0;
@@ -434,8 +432,8 @@ static int read_panorama_size(struct lights *l, const struct json *doc, const ch
     if (json_get_int(doc, "panorama.width", &width) ||
         json_get_int(doc, "panorama.height", &height) || width < 0 || width > 65536 ||
         width != 2 * height)
-        return refuse(file, "panorama",
-                      "must have integers width = 2 x height, at most 65536 (or 0: no panorama)");
+        return refuse(file, doc, "panorama",
+                      "expected integers width = 2 x height, at most 65536 (0: no panorama)");
     l->panorama_width_px = (int)width, l->panorama_height_px = (int)height;
     return 0;
 }
@@ -451,12 +449,12 @@ static int read_distance(struct lights *l, int i, const struct json *doc, const 
     if (err)
         return err;
     if (!(distance_m >= distance_min_m))
-        return refuse(file, key,
-                      "is below 1e-6 m: expected metres, or null for a directional light");
+        return refuse(file, doc, key,
+                      "below 1e-6 m; expected metres, or null for a directional light");
     l->inverse_distance[i] = 1 / distance_m;
 
-    light_key(key, i, "pos_m"); // says again what centre, rotation, direction and distance say: an
-                                // edit must be of both
+    // It says again what centre, rotation, direction and distance say: an edit must be of both.
+    light_key(key, i, "pos_m");
     if (!json_get(doc, key) || is_null(doc, key))
         return 0;
     const int pos_err = json_require_numbers(doc, key, pos_m, 3, file);
@@ -465,7 +463,7 @@ static int read_distance(struct lights *l, int i, const struct json *doc, const 
     light_position(l, i, expected);
     vec3_sub(pos_m, pos_m, expected);
     if (!(vec3_norm(pos_m) <= 1e-5 * (distance_m + vec3_norm(l->centre_m) + 1)))
-        return refuse(file, key,
+        return refuse(file, doc, key,
                       "is not centre_m + distance_m x world_from_probe x dir_probe: correct it, or "
                       "leave it out");
     return 0;
@@ -480,7 +478,7 @@ static int read_light(struct lights *l, int i, const struct json *doc, const cha
         return err;
     const double length = vec3_norm(dir);
     if (!(fabs(length - 1) <= 1e-6))
-        return refuse(file, key, "is not a unit vector (to 1e-6)");
+        return refuse(file, doc, key, "not a unit vector (to 1e-6)");
     if (fabs(length - 1) > 1e-15) // else it is one to rounding: keep every bit
         vec3_normalise(dir);
 
@@ -489,7 +487,7 @@ static int read_light(struct lights *l, int i, const struct json *doc, const cha
         return err;
     for (int c = 0; c < 3; c++)
         if (!(l->irradiance[i][c] >= 0 && l->irradiance[i][c] <= irradiance_max))
-            return refuse(file, key, "has a channel outside [0, 1e30]");
+            return refuse(file, doc, key, "a channel is outside [0, 1e30]");
     err = read_distance(l, i, doc, file);
     if (err)
         return err;
@@ -498,7 +496,7 @@ static int read_light(struct lights *l, int i, const struct json *doc, const cha
     light_key(key, i, "group");
     if (json_get(doc, key) && !is_null(doc, key) &&
         (json_get_int(doc, key, &group) || group < -1 || group >= l->n))
-        return refuse(file, key,
+        return refuse(file, doc, key,
                       "must be the number of an emitter (0 .. lights - 1), or -1 for none");
     l->group[i] = (int32_t)group;
 
@@ -513,7 +511,7 @@ static int read_light(struct lights *l, int i, const struct json *doc, const cha
             if (!(edge[k] >= 0 && edge[k] <= limit[k] && edge[k] == floor(edge[k])) ||
                 edge[k] < edge[k % 2])
                 return refuse(
-                    file, key,
+                    file, doc, key,
                     "must be pixels x0, y0, x1, y1 inside the panorama, x0 <= x1, y0 <= y1");
         l->region[i] =
             (struct light_region){(int)edge[0], (int)edge[1], (int)edge[2], (int)edge[3]};
@@ -524,19 +522,22 @@ static int read_light(struct lights *l, int i, const struct json *doc, const cha
         if (err)
             return err;
         if (!(l->spread_rad[i] >= 0 && l->spread_rad[i] <= M_PI))
-            return refuse(file, key, "is outside [0, pi]");
+            return refuse(file, doc, key, "outside [0, pi]");
     }
     return 0;
 }
 
 static int from_json(struct lights *out, const struct json *doc, const char *file)
 {
+    struct lights l = {0};
     const char *format;
     int err = json_require_string(doc, "format", &format, file);
     if (err)
-        return err;
-    if (strcmp(format, format_name))
-        return refuse(file, "format", "is not \"studiorig-lights-1\"");
+        goto fail;
+    if (strcmp(format, format_name)) {
+        err = refuse(file, doc, "format", "expected \"studiorig-lights-1\"");
+        goto fail;
+    }
     const int n = json_length(doc, "lights");
     if (n < 1 || n > LIGHTS_MAX) {
         log_error("lights: %s: lights: expected a list of 1 to %d lights, found %s", file,
@@ -544,22 +545,19 @@ static int from_json(struct lights *out, const struct json *doc, const char *fil
                   n > 0    ? "more"
                   : n == 0 ? "none"
                            : "no list");
-        return -EINVAL;
-    }
-    struct lights l;
-    err = lights_new(&l, n);
-    if (err)
-        return err;
-    if (json_get(doc, "lights.0.region"))
-        l.region = calloc((size_t)n, sizeof(*l.region));
-    if (json_get(doc, "lights.0.spread_rad"))
-        l.spread_rad = calloc((size_t)n, sizeof(*l.spread_rad));
-    if ((json_get(doc, "lights.0.region") && !l.region) ||
-        (json_get(doc, "lights.0.spread_rad") && !l.spread_rad)) {
-        err = -ENOMEM;
+        err = -EINVAL;
         goto fail;
     }
-    err = read_place(&l, doc, file);
+    err = lights_new(&l, n);
+    if (err)
+        goto fail;
+    const bool regions = json_get(doc, "lights.0.region"),
+               spreads = json_get(doc, "lights.0.spread_rad");
+    l.region = regions ? calloc((size_t)n, sizeof(*l.region)) : NULL;
+    l.spread_rad = spreads ? calloc((size_t)n, sizeof(*l.spread_rad)) : NULL;
+    err = (regions && !l.region) || (spreads && !l.spread_rad) ? -ENOMEM : 0;
+    if (!err)
+        err = read_place(&l, doc, file);
     if (!err)
         err = read_panorama_size(&l, doc, file);
     for (int i = 0; i < n && !err; i++)
@@ -570,7 +568,8 @@ static int from_json(struct lights *out, const struct json *doc, const char *fil
     return 0;
 fail:
     lights_free(&l);
-    return err;
+    // A missing key is a broken file; -ENOENT would say that there is no file.
+    return err == -ENOENT ? -EINVAL : err;
 }
 
 int lights_parse_json(struct lights *out, const char *text, size_t n_bytes,

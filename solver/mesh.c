@@ -255,11 +255,12 @@ int mesh_from_arrays(struct mesh *out, int n_vertices, float (*position_m)[3], f
         err = fill_charts(&m);
     if (err)
         goto fail;
-    for (int c = 0; c < 3; c++) {
-        m.bounds_m[0][c] = m.bounds_m[1][c] = position_m[0][c];
-        for (int i = 1; i < n_vertices; i++) {
-            m.bounds_m[0][c] = fmin(m.bounds_m[0][c], position_m[i][c]);
-            m.bounds_m[1][c] = fmax(m.bounds_m[1][c], position_m[i][c]);
+    for (int c = 0; c < 3; c++) { // over the triangles: a stray vertex counts for nothing
+        m.bounds_m[0][c] = m.bounds_m[1][c] = position_m[triangle[0][0]][c];
+        for (int i = 0; i < 3 * n_triangles; i++) {
+            const double x = position_m[triangle[i / 3][i % 3]][c];
+            m.bounds_m[0][c] = fmin(m.bounds_m[0][c], x);
+            m.bounds_m[1][c] = fmax(m.bounds_m[1][c], x);
         }
     }
     *out = m;
@@ -357,9 +358,10 @@ void mesh_check_log(const struct mesh_check *check, const struct mesh *m, const 
         log_warning("mesh: %s: %d of %d triangles have UVs outside [0,1]: what lies outside gets no texture; "
                     "pack the atlas into one tile", path, check->n_out_of_range_uv, n);
     if (check->n_mirrored_uv)
-        log_warning("mesh: %s: %d of %d triangles have mirrored UVs: textures are solved all the same; "
-                    "tangent-space normal maps need a renderer that keeps the handedness", path,
-                    check->n_mirrored_uv, n);
+        log_warning("mesh: %s: %d of %d triangles have mirrored UVs: %s", path, check->n_mirrored_uv, n,
+                    2 * check->n_mirrored_uv > n ?
+                    "the whole atlas seems upside down: check that the exporter wrote v the way the format says" :
+                    "textures are solved all the same; tangent-space normal maps need a renderer that keeps handedness");
     if (check->overlap_fraction > 0)
         log_warning("mesh: %s: %.3g %% of the atlas (at %d x %d) is covered by several triangles: each texel goes to "
                     "the first of them; unwrap without overlap", path, 100 * check->overlap_fraction,

@@ -63,7 +63,7 @@ static int clear_negatives(struct image *image, const char *path)
     const int x = (int)(first / 3 % image->width), y = (int)(first / 3 / image->width);
     if (n_negative)
         log_warning("panorama: %s: %" PRId64
-                    " negative values set to 0 (first at pixel %d,%d; lowest %g)",
+                    " negative values set to 0 (first at column %d, row %d; lowest %g)",
                     path, n_negative, x, y, (double)lowest);
     if (highest > 0)
         return 0;

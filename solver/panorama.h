@@ -15,6 +15,7 @@ int panorama_read(struct panorama *out, const char *path);
 void panorama_free(struct panorama *p);
 
 void panorama_direction(int width, int height, double x_px, double y_px, double dir[3]); // unit
+// x in [0, width), y in [0, height]: straight down is y = height. dir need not be unit.
 void panorama_pixel(int width, int height, const double dir[3], double *x_px, double *y_px);
 // Exact solid angle of one pixel of row y: (2 pi / W)(cos(pi y/H) - cos(pi (y+1)/H)).
 double panorama_solid_angle(int width, int height, int y);

@@ -1,8 +1,9 @@
 // solver/shapes.c - objects made by code: a pebble, a vase, a knot, a bowl, each with its UV atlas.
 //
-// Every shape is a handful of grids ("charts"). A chart's vertices carry a place, a normal and a flat position in metres;
-// grids that meet compute the place of a shared border from the same integers, so both get the same bits and the mesh
-// closes. At the end the charts' flat boxes are packed into the unit square at one common scale.
+// Every shape is a handful of grids ("charts"). A chart's vertices carry a place, a normal and a
+// flat position in metres; grids that meet compute the place of a shared border from the same
+// integers, so both get the same bits and the mesh closes. At the end the charts' flat boxes are
+// packed into the unit square at one common scale.
 #include "solver/shapes.h"
 #include "solver/vec3.h"
 
@@ -11,7 +12,7 @@
 #include <stdlib.h>
 #include <string.h>
 
-const char *const shape_names[SHAPE_N] = { "pebble", "vase", "knot", "bowl" };
+const char *const shape_names[SHAPE_N] = {"pebble", "vase", "knot", "bowl"};
 
 enum { MAX_CHARTS = 32, PROFILE_STEPS = 8192 };
 static const double MARGIN_UV = 1. / 96; // between charts, and to the border of the atlas
@@ -33,12 +34,12 @@ struct builder {
 static void builder_free(struct builder *b)
 {
     free(b->place), free(b->normal), free(b->flat), free(b->chart), free(b->triangle);
-    *b = (struct builder){ 0 };
+    *b = (struct builder){0};
 }
 
 static int builder_new(struct builder *b, int max_vertices, int max_triangles)
 {
-    *b = (struct builder){ .max_vertices = max_vertices, .max_triangles = max_triangles };
+    *b = (struct builder){.max_vertices = max_vertices, .max_triangles = max_triangles};
     const size_t n = (size_t)max_vertices;
     b->place = malloc(n * sizeof(*b->place));
     b->normal = malloc(n * sizeof(*b->normal));
@@ -54,10 +55,11 @@ static int builder_new(struct builder *b, int max_vertices, int max_triangles)
 static void begin_chart(struct builder *b)
 {
     assert(b->n_charts < MAX_CHARTS);
-    b->box[b->n_charts++] = (struct chart_box){ { INFINITY, INFINITY }, { -INFINITY, -INFINITY }, { 0 } };
+    b->box[b->n_charts++] = (struct chart_box){{INFINITY, INFINITY}, {-INFINITY, -INFINITY}, {0}};
 }
 
-static uint32_t add_vertex(struct builder *b, const double place[3], const double normal[3], double x, double y)
+static uint32_t add_vertex(struct builder *b, const double place[3], const double normal[3],
+                           double x, double y)
 {
     assert(b->n_vertices < b->max_vertices);
     const int i = b->n_vertices++;
@@ -80,7 +82,8 @@ static void add_triangle(struct builder *b, uint32_t i, uint32_t j, uint32_t k)
     t[0] = i, t[1] = j, t[2] = k;
 }
 
-// A grid of (n_columns + 1) x (n_rows + 1) vertices, added row by row from `first`; columns x rows is outwards.
+// A grid of (n_columns + 1) x (n_rows + 1) vertices, added row by row from `first`; columns x rows
+// is outwards.
 static void add_grid_triangles(struct builder *b, uint32_t first, int n_columns, int n_rows)
 {
     const uint32_t stride = (uint32_t)n_columns + 1;
@@ -99,7 +102,8 @@ static int pack_at(struct builder *b, double scale)
     double x = MARGIN_UV, y = MARGIN_UV, shelf = 0;
     for (int c = 0; c < b->n_charts; c++) {
         struct chart_box *box = &b->box[c];
-        const double w = scale * (box->max[0] - box->min[0]), h = scale * (box->max[1] - box->min[1]);
+        const double w = scale * (box->max[0] - box->min[0]),
+                     h = scale * (box->max[1] - box->min[1]);
         if (x > MARGIN_UV && x + w + MARGIN_UV > 1)
             x = MARGIN_UV, y += shelf + MARGIN_UV, shelf = 0;
         if (x + w + MARGIN_UV > 1 || y + h + MARGIN_UV > 1)
@@ -111,7 +115,8 @@ static int pack_at(struct builder *b, double scale)
     return 1;
 }
 
-// The largest scale whose shelves fit (coarse sweep: whether they fit is not monotonic in the scale).
+// The largest scale whose shelves fit (coarse sweep: whether they fit is not monotonic in the
+// scale).
 static double pack(struct builder *b)
 {
     double largest = 0;
@@ -124,10 +129,11 @@ static double pack(struct builder *b)
     return scale;
 }
 
-// Bounding box to centre_m, bounding sphere about it to radius_m, atlas packed, handed over to the mesh.
+// Bounding box to centre_m, bounding sphere about it to radius_m, atlas packed, handed over to the
+// mesh.
 static int finish(struct mesh *out, struct builder *b, const double centre_m[3], double radius_m)
 {
-    double low[3] = { INFINITY, INFINITY, INFINITY }, high[3] = { -INFINITY, -INFINITY, -INFINITY };
+    double low[3] = {INFINITY, INFINITY, INFINITY}, high[3] = {-INFINITY, -INFINITY, -INFINITY};
     double middle[3], radius = 0;
     for (int i = 0; i < b->n_vertices; i++)
         for (int k = 0; k < 3; k++)
@@ -140,10 +146,10 @@ static int finish(struct mesh *out, struct builder *b, const double centre_m[3],
         radius = fmax(radius, vec3_norm(d));
     }
     const double scale_uv = pack(b), scale = radius_m / radius;
-    float (*position_m)[3] = malloc((size_t)b->n_vertices * sizeof(*position_m));
-    float (*normal)[3] = malloc((size_t)b->n_vertices * sizeof(*normal));
-    float (*uv)[2] = malloc((size_t)b->n_vertices * sizeof(*uv));
-    uint32_t (*triangle)[3] = malloc((size_t)b->n_triangles * sizeof(*triangle));
+    float(*position_m)[3] = malloc((size_t)b->n_vertices * sizeof(*position_m));
+    float(*normal)[3] = malloc((size_t)b->n_vertices * sizeof(*normal));
+    float(*uv)[2] = malloc((size_t)b->n_vertices * sizeof(*uv));
+    uint32_t(*triangle)[3] = malloc((size_t)b->n_triangles * sizeof(*triangle));
     if (!position_m || !normal || !uv || !triangle) {
         free(position_m), free(normal), free(uv), free(triangle);
         return -ENOMEM;
@@ -162,24 +168,26 @@ static int finish(struct mesh *out, struct builder *b, const double centre_m[3],
     return mesh_from_arrays(out, b->n_vertices, position_m, normal, uv, b->n_triangles, triangle);
 }
 
-// ---- pebble: a convex body by its support function ----------------------------------------------------------------------
+// ---- pebble: a convex body by its support function ----------------------------------------------
 //
-// h(n) is how far the body reaches along n. Then the surface point with normal n is the gradient of h, made homogeneous of
-// degree one, and the body is convex while h's second derivatives stay positive. For h = P(n) / |n|^(k-1) with P of degree k
-// the gradient at a unit n is grad P - (k - 1) P n. So the normals are exact: they are the parameter.
+// h(n) is how far the body reaches along n. Then the surface point with normal n is the gradient of
+// h, made homogeneous of degree one, and the body is convex while h's second derivatives stay
+// positive. For h = P(n) / |n|^(k-1) with P of degree k the gradient at a unit n is grad P - (k -
+// 1) P n. So the normals are exact: they are the parameter.
 static void pebble_place(double place[3], const double n[3])
 {
-    static const double axes[3] = { 1, .8, .68 }; // ellipsoid: h = |axes * n|
+    static const double axes[3] = {1, .8, .68}; // ellipsoid: h = |axes * n|
     const double x = n[0], y = n[1], z = n[2];
-    double e[3] = { axes[0] * x, axes[1] * y, axes[2] * z };
+    double e[3] = {axes[0] * x, axes[1] * y, axes[2] * z};
     const double h = vec3_norm(e);
     for (int k = 0; k < 3; k++)
         place[k] = axes[k] * axes[k] * n[k] / h;
     const double cubic = .055 * (x * y * z) + .03 * (z * z * z - x * x * y);
-    const double cubic_gradient[3] = { .055 * y * z - .06 * x * y, .055 * x * z - .03 * x * x,
-                                       .055 * x * y + .09 * z * z };
+    const double cubic_gradient[3] = {.055 * y * z - .06 * x * y, .055 * x * z - .03 * x * x,
+                                      .055 * x * y + .09 * z * z};
     const double quartic = .03 * (x * x * x * y - y * y * y * z);
-    const double quartic_gradient[3] = { .09 * x * x * y, .03 * x * x * x - .09 * y * y * z, -.03 * y * y * y };
+    const double quartic_gradient[3] = {.09 * x * x * y, .03 * x * x * x - .09 * y * y * z,
+                                        -.03 * y * y * y};
     for (int k = 0; k < 3; k++)
         place[k] += cubic_gradient[k] - 2 * cubic * n[k] + quartic_gradient[k] - 3 * quartic * n[k];
 }
@@ -188,9 +196,9 @@ static int make_pebble(struct builder *b, int detail)
 {
     // Right, up and out of each face; right x up = out.
     static const int faces[6][3][3] = {
-        { { 0, 1, 0 }, { 0, 0, 1 }, { 1, 0, 0 } },   { { 0, -1, 0 }, { 0, 0, 1 }, { -1, 0, 0 } },
-        { { -1, 0, 0 }, { 0, 0, 1 }, { 0, 1, 0 } },  { { 1, 0, 0 }, { 0, 0, 1 }, { 0, -1, 0 } },
-        { { 1, 0, 0 }, { 0, 1, 0 }, { 0, 0, 1 } },   { { 1, 0, 0 }, { 0, -1, 0 }, { 0, 0, -1 } },
+        {{0, 1, 0}, {0, 0, 1}, {1, 0, 0}},  {{0, -1, 0}, {0, 0, 1}, {-1, 0, 0}},
+        {{-1, 0, 0}, {0, 0, 1}, {0, 1, 0}}, {{1, 0, 0}, {0, 0, 1}, {0, -1, 0}},
+        {{1, 0, 0}, {0, 1, 0}, {0, 0, 1}},  {{1, 0, 0}, {0, -1, 0}, {0, 0, -1}},
     };
     const int n = fmax(3, round(sqrt(detail / 12.)));
     int err = builder_new(b, 6 * (n + 1) * (n + 1), 12 * n * n);
@@ -201,7 +209,8 @@ static int make_pebble(struct builder *b, int detail)
         const uint32_t first = (uint32_t)b->n_vertices;
         for (int j = 0; j <= n; j++) {
             for (int i = 0; i <= n; i++) {
-                // Equal angles per step. The exact 1 at the rim lets neighbouring faces agree to the bit.
+                // Equal angles per step. The exact 1 at the rim lets neighbouring faces agree to
+                // the bit.
                 const int a = 2 * i - n, c = 2 * j - n;
                 const double s = a == n ? 1 : a == -n ? -1 : tan(M_PI / 4 * a / n);
                 const double t = c == n ? 1 : c == -n ? -1 : tan(M_PI / 4 * c / n);
@@ -218,34 +227,39 @@ static int make_pebble(struct builder *b, int detail)
     return 0;
 }
 
-// ---- vase and bowl: a closed profile turned about z ----------------------------------------------------------------------
+// ---- vase and bowl: a closed profile turned about z ---------------------------------------------
 //
-// The profile (r, z) is a uniform cubic B-spline from the lower pole to the upper pole; its control points are mirrored at
-// both poles, so the surface is smooth there. Charts: a disc about each pole, and between them bands of wall in two halves.
+// The profile (r, z) is a uniform cubic B-spline from the lower pole to the upper pole; its control
+// points are mirrored at both poles, so the surface is smooth there. Charts: a disc about each
+// pole, and between them bands of wall in two halves.
 struct profile {
     int n_control;
     double control[16][2];
-    double r[PROFILE_STEPS + 1], z[PROFILE_STEPS + 1], s[PROFILE_STEPS + 1]; // sampled; s: arc length
+    double r[PROFILE_STEPS + 1], z[PROFILE_STEPS + 1],
+        s[PROFILE_STEPS + 1]; // sampled; s: arc length
 };
 
 static void control_point(const struct profile *p, int i, double out[2])
 {
     const int last = p->n_control - 1;
-    const double *c = i < 0 ? p->control[-i - 1] : i > last ? p->control[2 * last + 1 - i] : p->control[i];
+    const double *c = i < 0      ? p->control[-i - 1]
+                      : i > last ? p->control[2 * last + 1 - i]
+                                 : p->control[i];
     out[0] = i < 0 || i > last ? -c[0] : c[0];
     out[1] = c[1];
 }
 
 static void sample_profile(struct profile *p)
 {
-    // The mirror lies half way between control points 0 and -1: knots run from there over n_control whole spans.
+    // The mirror lies half way between control points 0 and -1: knots run from there over n_control
+    // whole spans.
     for (int i = 0; i <= PROFILE_STEPS; i++) {
         const double t = (double)p->n_control * i / PROFILE_STEPS - .5;
         const int span = (int)floor(t);
         const double f = t - span, g = 1 - f;
-        const double w[4] = { g * g * g / 6, (3 * f * f * f - 6 * f * f + 4) / 6, (3 * g * g * g - 6 * g * g + 4) / 6,
-                              f * f * f / 6 };
-        double at[2] = { 0, 0 };
+        const double w[4] = {g * g * g / 6, (3 * f * f * f - 6 * f * f + 4) / 6,
+                             (3 * g * g * g - 6 * g * g + 4) / 6, f * f * f / 6};
+        double at[2] = {0, 0};
         for (int k = 0; k < 4; k++) {
             double c[2];
             control_point(p, span - 1 + k, c);
@@ -271,9 +285,11 @@ static void profile_at(const struct profile *p, double s, double *r, double *z, 
     const double f = (s - p->s[low]) / (p->s[high] - p->s[low]);
     *r = p->r[low] + f * (p->r[high] - p->r[low]);
     *z = p->z[low] + f * (p->z[high] - p->z[low]);
-    double slope[2][2]; // central differences at both ends, blended; beyond a pole the profile is its own mirror image
+    double slope[2][2]; // central differences at both ends, blended; beyond a pole the profile is
+                        // its own mirror image
     for (int e = 0; e < 2; e++) {
-        const int i = low + e, i0 = i > 0 ? i - 1 : 1, i1 = i < PROFILE_STEPS ? i + 1 : PROFILE_STEPS - 1;
+        const int i = low + e, i0 = i > 0 ? i - 1 : 1,
+                  i1 = i < PROFILE_STEPS ? i + 1 : PROFILE_STEPS - 1;
         slope[e][0] = (i < PROFILE_STEPS ? p->r[i1] : -p->r[i1]) - (i > 0 ? p->r[i0] : -p->r[i0]);
         slope[e][1] = p->z[i1] - p->z[i0];
     }
@@ -287,7 +303,8 @@ struct turned {
     double step;          // arc length per row
 };
 
-// Vertex of row j at the column'th step around; everything from the integers, so shared borders agree.
+// Vertex of row j at the column'th step around; everything from the integers, so shared borders
+// agree.
 static void turned_at(const struct turned *t, int column, int j, double place[3], double normal[3])
 {
     double r, z, n[2];
@@ -301,7 +318,8 @@ static void turned_at(const struct turned *t, int column, int j, double place[3]
     normal[0] = n[0] * x, normal[1] = n[0] * y, normal[2] = n[1];
 }
 
-// The disc about a pole, rows 0..rim (lower) or rim..n_rows (upper), flattened so that lengths from the pole are kept.
+// The disc about a pole, rows 0..rim (lower) or rim..n_rows (upper), flattened so that lengths from
+// the pole are kept.
 static void add_disc(struct builder *b, const struct turned *t, bool upper, int rim)
 {
     const int n_rings = upper ? t->n_rows - rim : rim;
@@ -320,9 +338,10 @@ static void add_disc(struct builder *b, const struct turned *t, bool upper, int 
     for (int k = 0; k < n_rings; k++) {
         for (int i = 0; i < t->n_around; i++) {
             const int i1 = (i + 1) % t->n_around;
-            const uint32_t outer = pole + 1 + (uint32_t)(k * t->n_around), inner = outer - (uint32_t)t->n_around;
-            const uint32_t a = inner + (uint32_t)i, c = inner + (uint32_t)i1, d = outer + (uint32_t)i,
-                           e = outer + (uint32_t)i1;
+            const uint32_t outer = pole + 1 + (uint32_t)(k * t->n_around),
+                           inner = outer - (uint32_t)t->n_around;
+            const uint32_t a = inner + (uint32_t)i, c = inner + (uint32_t)i1,
+                           d = outer + (uint32_t)i, e = outer + (uint32_t)i1;
             if (k == 0) {
                 add_triangle(b, pole, upper ? d : e, upper ? e : d);
             } else if (upper) {
@@ -337,8 +356,8 @@ static void add_disc(struct builder *b, const struct turned *t, bool upper, int 
 }
 
 // cut[n_cuts]: where along the profile one chart ends and the next begins, as shares of its length.
-static int make_turned(struct builder *b, int detail, const double (*control)[2], int n_control, const double *cut,
-                       int n_cuts)
+static int make_turned(struct builder *b, int detail, const double (*control)[2], int n_control,
+                       const double *cut, int n_cuts)
 {
     struct turned *t = calloc(1, sizeof(*t));
     if (!t)
@@ -361,7 +380,8 @@ static int make_turned(struct builder *b, int detail, const double (*control)[2]
         row[k] = (int)fmax(k ? row[k - 1] + 1 : 1, round(cut[k] * t->n_rows));
         row[k] = (int)fmin(row[k], t->n_rows - n_cuts + k);
     }
-    int err = builder_new(b, (t->n_around + 2) * (t->n_rows + 2 + n_cuts) + 2, 2 * t->n_around * t->n_rows);
+    int err = builder_new(b, (t->n_around + 2) * (t->n_rows + 2 + n_cuts) + 2,
+                          2 * t->n_around * t->n_rows);
     if (err)
         goto done;
     for (int part = 0; part < 2 * (n_cuts - 1); part++) {
@@ -389,26 +409,28 @@ done:
 static int make_vase(struct builder *b, int detail)
 {
     static const double control[][2] = {
-        { .16, 0 },    { .42, 0 },   { .6, .12 },  { .82, .5 },   { .8, .98 },   { .48, 1.36 },
-        { .32, 1.68 }, { .42, 2 },   { .56, 2.14 }, { .5, 2.28 }, { .36, 2.2 },  { .26, 1.95 },
-        { .18, 1.76 }, { .06, 1.72 },
+        {.16, 0}, {.42, 0},    {.6, .12},  {.82, .5},  {.8, .98},   {.48, 1.36}, {.32, 1.68},
+        {.42, 2}, {.56, 2.14}, {.5, 2.28}, {.36, 2.2}, {.26, 1.95}, {.18, 1.76}, {.06, 1.72},
     };
-    return make_turned(b, detail, control, sizeof(control) / sizeof(control[0]), (const double[]){ .1, .82 }, 2);
+    return make_turned(b, detail, control, sizeof(control) / sizeof(control[0]),
+                       (const double[]){.1, .82}, 2);
 }
 
 static int make_bowl(struct builder *b, int detail)
 {
     static const double control[][2] = {
-        { .15, 0 },   { .5, 0 },     { .84, .12 }, { 1.04, .48 }, { 1.08, .9 }, { 1.04, 1.1 },
-        { .9, 1.1 },  { .84, .9 },   { .8, .52 },  { .6, .27 },   { .2, .2 },
+        {.15, 0},  {.5, 0},   {.84, .12}, {1.04, .48}, {1.08, .9}, {1.04, 1.1},
+        {.9, 1.1}, {.84, .9}, {.8, .52},  {.6, .27},   {.2, .2},
     };
-    return make_turned(b, detail, control, sizeof(control) / sizeof(control[0]), (const double[]){ .16, .56, .79 }, 3);
+    return make_turned(b, detail, control, sizeof(control) / sizeof(control[0]),
+                       (const double[]){.16, .56, .79}, 3);
 }
 
-// ---- knot: a tube along a (2,3) torus knot ------------------------------------------------------------------------------
+// ---- knot: a tube along a (2,3) torus knot ------------------------------------------------------
 //
-// The tube's frame is the torus' own normal and its product with the tangent: both close after one turn of the parameter.
-// The tube is cut into N_PIECES pieces of equal length, each unrolled to a rectangle: one chart each.
+// The tube's frame is the torus' own normal and its product with the tangent: both close after one
+// turn of the parameter. The tube is cut into N_PIECES pieces of equal length, each unrolled to a
+// rectangle: one chart each.
 enum { N_PIECES = 24, KNOT_STEPS = 16384 };
 
 static void knot_frame(double t, double at[3], double tangent[3], double normal[3])
@@ -437,7 +459,8 @@ static int make_knot(struct builder *b, int detail)
     }
     const double length = s[KNOT_STEPS], around = 2 * M_PI * tube;
     const int n_around = (int)fmax(6, round(sqrt(detail / 2. * around / length)));
-    const int n_along = (int)fmax(2, round(detail / 2. / n_around / N_PIECES)), n_total = n_along * N_PIECES;
+    const int n_along = (int)fmax(2, round(detail / 2. / n_around / N_PIECES)),
+              n_total = n_along * N_PIECES;
     int err = builder_new(b, N_PIECES * (n_along + 1) * (n_around + 1), 2 * n_total * n_around);
     if (err)
         goto done;
@@ -456,7 +479,8 @@ static int make_knot(struct builder *b, int detail)
                     else
                         high = middle;
                 }
-                const double t = 2 * M_PI / KNOT_STEPS * (low + (here - s[low]) / (s[high] - s[low]));
+                const double t =
+                    2 * M_PI / KNOT_STEPS * (low + (here - s[low]) / (s[high] - s[low]));
                 double at[3], tangent[3], normal[3], side[3], out[3], place[3];
                 knot_frame(t, at, tangent, normal);
                 vec3_normalise(tangent);
@@ -476,12 +500,15 @@ done:
     return err;
 }
 
-int shape_make(struct mesh *out, enum shape shape, const double centre_m[3], double radius_m, int detail)
+int shape_make(struct mesh *out, enum shape shape, const double centre_m[3], double radius_m,
+               int detail)
 {
-    static int (*const make[SHAPE_N])(struct builder *, int) = { make_pebble, make_vase, make_knot, make_bowl };
-    struct builder b = { 0 };
-    *out = (struct mesh){ 0 };
-    if ((unsigned)shape >= SHAPE_N || !(radius_m > 0) || !isfinite(radius_m) || detail < 100 || detail > 4000000)
+    static int (*const make[SHAPE_N])(struct builder *, int) = {make_pebble, make_vase, make_knot,
+                                                                make_bowl};
+    struct builder b = {0};
+    *out = (struct mesh){0};
+    if ((unsigned)shape >= SHAPE_N || !(radius_m > 0) || !isfinite(radius_m) || detail < 100 ||
+        detail > 4000000)
         return -EINVAL;
     int err = make[shape](&b, detail);
     if (!err)

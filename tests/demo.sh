@@ -8,34 +8,35 @@ step() { printf '\n== %s\n' "$*"; }
 case $out in */demo) rm -rf "$out" ;; *) echo "demo: refusing to replace $out: its name must end in /demo" >&2; exit 2 ;; esac
 mkdir -p "$out"
 
-step "1/5 a studio: data set D3 (one Disney material, off centre), 85 views, lit by 4,096 small lights on the walls of a room"
-"$rigsolve" synth D3 -o "$out/take" --size 360x240 --true-lights 4096 --seed 1 --samples 2
+step "1/5 a studio: data set D3 (one Disney material, off centre), 85 views, lit by 16,384 small lights on the walls of a room"
+"$rigsolve" synth D3 -o "$out/take" --size 360x240 --true-lights 16384 --seed 1 --samples 2
 step "2/5 the panorama becomes 256 lights by median cut"
 "$rigsolve" lights "$out/take/panorama.exr" -n 256 -o "$out/lights.json" --overlay "$out/lights.png"
 step "3/5 who sees which texel: 85 cameras and 256 lights, traced"
-"$rigsolve" visibility "$out/take" -o "$out" --texture 256 --lights 256 --overlay "$out/outlines"
+"$rigsolve" visibility "$out/take" -o "$out" --texture 256 --lights 256 --overlay "$out/outlines" |
+    tail -n 2
 step "4/5 the true material under the 256 lights, from the true place of the probe, seen by the same cameras"
 "$rigsolve" render "$out/take/truth" --cameras "$out/take/geometry/cameras" -o "$out/views" \
     --panorama "$out/take/panorama.exr" --world-from-probe "$out/take/truth/probe.json" --radius 1.5
-step "5/5 how far 256 lights, all guessed 1.5 m away, are from the 4,096 true ones"
+step "5/5 how far 256 lights, all guessed 1.5 m away, are from the 16,384 true ones"
 "$rigsolve" compare "$out/views" "$out/take/linear" >"$out/compare.txt"
 tail -n 3 "$out/compare.txt"
 
-picture() { # file, caption
-    [ -f "$1" ] && printf '<figure><img alt="%s" src="data:image/png;base64,%s"><figcaption>%s</figcaption></figure>\n' \
-        "$2" "$(base64 -w0 "$1")" "$2"
+picture() { # file, caption, class
+    [ -f "$1" ] && printf '<figure class="%s"><img alt="%s" src="data:image/png;base64,%s"><figcaption>%s</figcaption></figure>\n' \
+        "${3:-}" "$2" "$(base64 -w0 "$1")" "$2"
 }
 {
     cat <<'HTML'
 <!doctype html><html lang="en"><meta charset="utf-8"><title>studiorig: a synthetic studio</title>
 <style>body{font:16px/1.5 system-ui,sans-serif;max-width:75rem;margin:2rem auto;padding:0 1rem;background:#16181c;color:#ddd}
-h1,h2{font-weight:600}figure{display:inline-block;margin:.4rem;vertical-align:top}img{max-width:100%;border-radius:4px;display:block;background:#000}
+h1,h2{font-weight:600}figure{display:inline-block;margin:.4rem;vertical-align:top;width:calc(50% - 1rem)}figure.wide{width:100%}img{width:100%;border-radius:4px;display:block;background:#000}
 figcaption{font-size:.85rem;color:#999;max-width:45rem}pre{background:#222;padding:1rem;overflow:auto;border-radius:4px}</style>
 <h1>A synthetic studio, end to end</h1>
 <p>Data set D3: one Disney material with a coloured albedo, off the centre of a room whose walls carry four bright panels.</p>
 <h2>The lights</h2>
 HTML
-    picture "$out/lights.png" "The panorama, cut into 256 regions of equal energy; a dot marks each light's direction."
+    picture "$out/lights.png" "The panorama, cut into 256 regions of equal energy; a dot marks each light's direction." wide
     echo '<h2>What the cameras see</h2>'
     for v in 000 020 040 060; do picture "$out/outlines/cam$v.png" "cam$v with the mesh's outline, traced"; done
     echo '<h2>The same under 256 lights at a guessed distance of 1.5 m</h2>'

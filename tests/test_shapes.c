@@ -1,4 +1,5 @@
-// tests/test_shapes.c - objects made by code are closed, outward, cleanly unwrapped; the pebble does not shadow itself.
+// tests/test_shapes.c - objects made by code are closed, outward, cleanly unwrapped; the pebble
+// does not shadow itself.
 #include "solver/rays.h"
 #include "solver/shapes.h"
 #include "solver/texels.h"
@@ -14,8 +15,8 @@
 #include <string.h>
 #include <cmocka.h>
 
-static const double centre_m[3] = { .4, -.2, 1.1 };
-static const int details[] = { 100, 1500, 20000 };
+static const double centre_m[3] = {.4, -.2, 1.1};
+static const int details[] = {100, 1500, 20000};
 enum { N_DETAILS = sizeof(details) / sizeof(details[0]) };
 
 static void make(struct mesh *mesh, enum shape shape, int detail)
@@ -42,7 +43,7 @@ static void cross_of(const struct mesh *mesh, int triangle, double cross[3])
 static void every_shape_is_a_closed_manifold_with_a_clean_atlas(void **state)
 {
     (void)state;
-    static const int charts[SHAPE_N] = { 6, 4, 24, 6 };
+    static const int charts[SHAPE_N] = {6, 4, 24, 6};
     for (int shape = 0; shape < SHAPE_N; shape++) {
         for (int d = 0; d < N_DETAILS; d++) {
             struct mesh mesh;
@@ -79,7 +80,8 @@ static void winding_is_outward_and_normals_follow_the_facets(void **state)
             for (int k = 0; k < 3; k++) {
                 const float *n = mesh.normal[mesh.triangle[t][k]];
                 assert_float_equal(n[0] * n[0] + n[1] * n[1] + n[2] * n[2], 1, 1e-5);
-                // lips are turned within a few rows of facets, so 24 degrees there; a wrong normal is far off
+                // lips are turned within a few rows of facets, so 24 degrees there; a wrong normal
+                // is far off
                 assert_true(cross[0] * n[0] + cross[1] * n[1] + cross[2] * n[2] > .9);
             }
         }
@@ -98,8 +100,9 @@ static void size_and_place_are_as_asked(void **state)
         for (int i = 0; i < 3; i++)
             assert_float_equal((mesh.bounds_m[0][i] + mesh.bounds_m[1][i]) / 2, centre_m[i], 1e-6);
         for (int v = 0; v < mesh.n_vertices; v++) {
-            const double d[3] = { mesh.position_m[v][0] - centre_m[0], mesh.position_m[v][1] - centre_m[1],
-                                  mesh.position_m[v][2] - centre_m[2] };
+            const double d[3] = {mesh.position_m[v][0] - centre_m[0],
+                                 mesh.position_m[v][1] - centre_m[1],
+                                 mesh.position_m[v][2] - centre_m[2]};
             farthest = fmax(farthest, vec3_norm(d));
         }
         assert_float_equal(farthest, .3, 1e-6);
@@ -108,8 +111,8 @@ static void size_and_place_are_as_asked(void **state)
     }
 }
 
-// Distances on the surface against distances in the atlas, along both directions of every triangle's map: texels of one
-// size should cover about one size of surface.
+// Distances on the surface against distances in the atlas, along both directions of every
+// triangle's map: texels of one size should cover about one size of surface.
 static void atlas_distortion_stays_low(void **state)
 {
     (void)state;
@@ -123,7 +126,8 @@ static void atlas_distortion_stays_low(void **state)
                         *c = mesh.uv[mesh.triangle[t][2]];
             cross_of(&mesh, t, cross);
             area += vec3_norm(cross);
-            area_uv += (b[0] - a[0]) * (double)(c[1] - a[1]) - (b[1] - a[1]) * (double)(c[0] - a[0]);
+            area_uv +=
+                (b[0] - a[0]) * (double)(c[1] - a[1]) - (b[1] - a[1]) * (double)(c[0] - a[0]);
         }
         const double expected = area_uv / area;
         for (int t = 0; t < mesh.n_triangles; t++) {
@@ -131,12 +135,15 @@ static void atlas_distortion_stays_low(void **state)
             const float *a = mesh.uv[mesh.triangle[t][0]], *b = mesh.uv[mesh.triangle[t][1]],
                         *c = mesh.uv[mesh.triangle[t][2]];
             cross_of(&mesh, t, cross);
-            const double ratio = ((b[0] - a[0]) * (double)(c[1] - a[1]) - (b[1] - a[1]) * (double)(c[0] - a[0])) /
-                                 vec3_norm(cross) / expected;
+            const double ratio =
+                ((b[0] - a[0]) * (double)(c[1] - a[1]) - (b[1] - a[1]) * (double)(c[0] - a[0])) /
+                vec3_norm(cross) / expected;
             if (ratio < .3 || ratio > 3)
                 bad += vec3_norm(cross);
         }
-        fprintf(stderr, "# %s: atlas filled to %.0f%%, texel density off by more than 3x on %.2f%% of the surface\n",
+        fprintf(stderr,
+                "# %s: atlas filled to %.0f%%, texel density off by more than 3x on %.2f%% of the "
+                "surface\n",
                 shape_names[shape], 50 * area_uv, 100 * bad / area);
         assert_true(bad / area < .05);
         assert_true(area_uv / 2 > .35);
@@ -144,8 +151,8 @@ static void atlas_distortion_stays_low(void **state)
     }
 }
 
-// Charts keep at least 1/128 between each other and from the border: dilate every covered texel by just under that and no
-// two charts may meet.
+// Charts keep at least 1/128 between each other and from the border: dilate every covered texel by
+// just under that and no two charts may meet.
 static void charts_keep_their_distance(void **state)
 {
     (void)state;
@@ -188,8 +195,9 @@ static void a_pebble_never_shadows_itself(void **state)
         float start_m[3];
         rays_start(rays, t.triangle[i], t.barycentric[i], start_m);
         for (int k = 0; k < 200; k++) { // a spiral over the sphere
-            const double z = 1 - (2 * k + 1) / 200., s = sqrt(1 - z * z), angle = 2.399963 * k + .1 * i;
-            const float l[3] = { (float)(s * cos(angle)), (float)(s * sin(angle)), (float)z };
+            const double z = 1 - (2 * k + 1) / 200., s = sqrt(1 - z * z),
+                         angle = 2.399963 * k + .1 * i;
+            const float l[3] = {(float)(s * cos(angle)), (float)(s * sin(angle)), (float)z};
             if (n[0] * l[0] + n[1] * l[1] + n[2] * l[2] <= .05f)
                 continue;
             n_rays++;
@@ -205,7 +213,7 @@ static void a_pebble_never_shadows_itself(void **state)
 static void knot_and_bowl_do_shadow_themselves(void **state)
 {
     (void)state;
-    static const enum shape concave[] = { SHAPE_KNOT, SHAPE_BOWL };
+    static const enum shape concave[] = {SHAPE_KNOT, SHAPE_BOWL};
     for (int s = 0; s < 2; s++) {
         struct mesh mesh;
         struct rays *rays;
@@ -219,7 +227,7 @@ static void knot_and_bowl_do_shadow_themselves(void **state)
             vec3_normalise(cross);
             for (int i = 0; i < 3; i++)
                 along[i] = (float)cross[i];
-            rays_start(rays, (uint32_t)t, (const float[2]){ .33f, .33f }, start_m);
+            rays_start(rays, (uint32_t)t, (const float[2]){.33f, .33f}, start_m);
             n_blocked += rays_blocked(rays, start_m, along, 0, INFINITY);
         }
         assert_true(n_blocked > mesh.n_triangles / 20);
@@ -236,7 +244,8 @@ static void the_same_arguments_give_the_same_bytes(void **state)
         make(&a, shape, 3000);
         make(&b, shape, 3000);
         assert_int_equal(a.n_vertices, b.n_vertices);
-        assert_memory_equal(a.position_m, b.position_m, (size_t)a.n_vertices * sizeof(*a.position_m));
+        assert_memory_equal(a.position_m, b.position_m,
+                            (size_t)a.n_vertices * sizeof(*a.position_m));
         assert_memory_equal(a.normal, b.normal, (size_t)a.n_vertices * sizeof(*a.normal));
         assert_memory_equal(a.uv, b.uv, (size_t)a.n_vertices * sizeof(*a.uv));
         assert_memory_equal(a.triangle, b.triangle, (size_t)a.n_triangles * sizeof(*a.triangle));

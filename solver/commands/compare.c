@@ -76,8 +76,7 @@ static const struct argp argp = {
     NULL,
 };
 
-// ---- pictures of a folder
-// -----------------------------------------------------------------------------------------------
+// ---- pictures of a folder -----------------------------------------------------------------------
 
 struct picture {
     char *stem, *path;
@@ -174,8 +173,7 @@ static const char *folder_find(const struct folder *f, const char *stem)
     return found ? found->path : NULL;
 }
 
-// ---- comparing
-// ----------------------------------------------------------------------------------------------------------
+// ---- comparing ----------------------------------------------------------------------------------
 
 static int compare_files(struct comparison *out, const char *a, const char *b, const char *mask)
 {

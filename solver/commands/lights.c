@@ -92,8 +92,7 @@ static const struct argp argp = {
     NULL,
 };
 
-// ---- the summary
-// --------------------------------------------------------------------------------------------------------
+// ---- the summary --------------------------------------------------------------------------------
 
 enum { N_STRONGEST = 5, PLATEAU_PX = 16 };
 
@@ -223,8 +222,7 @@ static int print_json(const struct summary *s, const struct arguments *a, const 
     return 0;
 }
 
-// ---- the overlay
-// --------------------------------------------------------------------------------------------------------
+// ---- the overlay --------------------------------------------------------------------------------
 
 enum { OVERLAY_MIN_WIDTH = 2048 };
 
@@ -355,10 +353,10 @@ int command_lights(int argc, char **argv)
         goto done;
     summarise(&s, &p, &l);
     if (s.plateau_px > PLATEAU_PX)
-        log_warning(
-            "lights: %s: %d pixels in a row at exactly the highest value (from %d,%d): if this "
-            "is a photograph, its lamps are clipped and too dark: add a shorter exposure",
-            a.panorama, s.plateau_px, s.plateau_x, s.plateau_y);
+        log_warning("lights: %s: %d pixels in a row at exactly the highest value (from column %d, "
+                    "row %d): if this "
+                    "is a photograph, its lamps are clipped and too dark: add a shorter exposure",
+                    a.panorama, s.plateau_px, s.plateau_x, s.plateau_y);
     err = lights_write_json(&l, a.output);
     if (!err && a.overlay)
         err = write_overlay(&a, &p, &l, &s);

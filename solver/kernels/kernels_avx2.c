@@ -101,24 +101,26 @@ V vf v_bytes(const uint8_t *p, int n)
 }
 
 // sums[0..n) += the lanes of x[0..n), four vectors at a time.
-V void add_up(const vf *x, int n, double *sums)
+V void add_up(const vf *x, int n, float *sums)
 {
     for (int begin = 0; begin < n; begin += 4) {
         vf t[4];
         for (int i = 0; i < 4; i++)
             t[i] = begin + i < n ? x[begin + i] : v_set1(0);
         const vf halves = _mm256_hadd_ps(_mm256_hadd_ps(t[0], t[1]), _mm256_hadd_ps(t[2], t[3]));
-        float lane[4];
-        _mm_storeu_ps(lane, _mm256_castps256_ps128(halves) + _mm256_extractf128_ps(halves, 1));
-        for (int i = 0; i < 4 && begin + i < n; i++)
-            sums[begin + i] += (double)lane[i];
+        const __m128 four = _mm256_castps256_ps128(halves) + _mm256_extractf128_ps(halves, 1);
+        if (n - begin >= 4)
+            _mm_storeu_ps(sums + begin, _mm_loadu_ps(sums + begin) + four);
+        else
+            for (int i = 0; i < n - begin; i++)
+                sums[begin + i] += four[i];
     }
 }
 
 #include "solver/kernels/kernels_body.h"
 
 static const struct kernels table = {
-    "avx2", gather, shade, shade_jacobian, brute_jacobian, irradiance,
+    "avx2", gather, shade, shade_jacobian, brute_jacobian, irradiance, shade_jacobian_views,
 };
 const struct kernels *const kernels_avx2_table = &table;
 #else

@@ -89,8 +89,8 @@ V vf v_bytes(const uint8_t *p, int n)
     return _mm512_cvtepi32_ps(_mm512_cvtepu8_epi32(_mm_maskz_loadu_epi8(there, p)));
 }
 
-// sums[0..n) += the lanes of x[0..n), 16 vectors at a time: four rounds of "add halves" leave one sum per lane,
-// that of vector i in lane 4 (i mod 4) + i/4.
+// sums[0..n) += the lanes of x[0..n), 16 vectors at a time: four rounds of "add halves" leave one sum per lane;
+// what stands at 4 (i mod 4) + i/4 ends in lane i.
 V vf pair(vf a, vf b, int round)
 {
     switch (round) {
@@ -104,26 +104,24 @@ V vf pair(vf a, vf b, int round)
         return _mm512_shuffle_ps(a, b, 0x88) + _mm512_shuffle_ps(a, b, 0xdd);
     }
 }
-V void add_up(const vf *x, int n, double *sums)
+V void add_up(const vf *x, int n, float *sums)
 {
     for (int begin = 0; begin < n; begin += 16) {
         vf t[16];
         for (int i = 0; i < 16; i++)
-            t[i] = begin + i < n ? x[begin + i] : v_set1(0);
+            t[i % 4 * 4 + i / 4] = begin + i < n ? x[begin + i] : v_set1(0);
         for (int round = 0, left = 8; round < 4; round++, left /= 2)
             for (int i = 0; i < left; i++)
                 t[i] = pair(t[2 * i], t[2 * i + 1], round);
-        float lane[16] __attribute__((aligned(64)));
-        v_store(lane, t[0]);
-        for (int i = 0; i < 16 && begin + i < n; i++)
-            sums[begin + i] += (double)lane[i % 4 * 4 + i / 4];
+        const v_mask there = (v_mask)(n - begin >= 16 ? 0xffff : (1u << (n - begin)) - 1);
+        _mm512_mask_storeu_ps(sums + begin, there, _mm512_maskz_loadu_ps(there, sums + begin) + t[0]);
     }
 }
 
 #include "solver/kernels/kernels_body.h"
 
 static const struct kernels table = {
-    "avx512", gather, shade, shade_jacobian, brute_jacobian, irradiance,
+    "avx512", gather, shade, shade_jacobian, brute_jacobian, irradiance, shade_jacobian_views,
 };
 const struct kernels *const kernels_avx512_table = &table;
 #else

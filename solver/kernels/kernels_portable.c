@@ -27,10 +27,6 @@ V vf v_fma(vf a, vf b, vf c)
 {
     return a * b + c;
 }
-V vf v_fnma(vf a, vf b, vf c)
-{
-    return c - a * b;
-}
 V vf v_max(vf a, vf b)
 {
     const vi more = a > b;
@@ -101,14 +97,14 @@ V vf v_bytes(const uint8_t *p, int n)
 }
 
 // sums[0..n) += the lanes of x[0..n)
-V void add_up(const vf *x, int n, double *sums)
+V void add_up(const vf *x, int n, float *sums)
 {
     for (int i = 0; i < n; i++)
-        sums[i] += (double)((x[i][0] + x[i][1]) + (x[i][2] + x[i][3]));
+        sums[i] += (x[i][0] + x[i][1]) + (x[i][2] + x[i][3]);
 }
 
 #include "solver/kernels/kernels_body.h"
 
 const struct kernels kernels_portable_table = {
-    "portable", gather, shade, shade_jacobian, brute_jacobian, irradiance,
+    "portable", gather, shade, shade_jacobian, brute_jacobian, irradiance, shade_jacobian_views,
 };

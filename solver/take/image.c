@@ -53,22 +53,26 @@ int image_check_size(const struct image_file *file, int64_t width, int64_t heigh
                      int stored_bytes)
 {
     if (width < 1 || height < 1 || n_channels < 1) {
-        log_error("image: %s: found %lld x %lld pixels of %d channels, expected at least one of each",
-                  file->name, (long long)width, (long long)height, n_channels);
+        log_error(
+            "image: %s: found %lld x %lld pixels of %d channels, expected at least one of each",
+            file->name, (long long)width, (long long)height, n_channels);
         return -EINVAL;
     }
     if (width > MAX_SIDE_PX || height > MAX_SIDE_PX || width * height > MAX_PIXELS ||
         n_channels > IMAGE_MAX_CHANNELS) {
-        log_error("image: %s: %lld x %lld pixels of %d channels; at most %d a side, %d pixels and %d channels "
+        log_error("image: %s: %lld x %lld pixels of %d channels; at most %d a side, %d pixels and "
+                  "%d channels "
                   "are read",
-                  file->name, (long long)width, (long long)height, n_channels, MAX_SIDE_PX, MAX_PIXELS,
-                  IMAGE_MAX_CHANNELS);
+                  file->name, (long long)width, (long long)height, n_channels, MAX_SIDE_PX,
+                  MAX_PIXELS, IMAGE_MAX_CHANNELS);
         return -EFBIG;
     }
     const uint64_t asked = (uint64_t)(width * height) * (uint64_t)stored_bytes;
     if (asked > file->n_bytes * MAX_RATIO + FREE_BYTES) {
-        log_error("image: %s: the header asks for %llu bytes of pixels, which a file of %zu bytes cannot hold",
-                  file->name, (unsigned long long)asked, file->n_bytes);
+        log_error("image: %s: the header asks for %lld x %lld pixels (%llu bytes), which a file of "
+                  "%zu bytes cannot hold",
+                  file->name, (long long)width, (long long)height, (unsigned long long)asked,
+                  file->n_bytes);
         return -EFBIG;
     }
     return 0;
@@ -79,8 +83,8 @@ int image_new_for(struct image *out, const struct image_file *file, int width, i
 {
     const int err = image_new(out, width, height, n_channels, names);
     if (err)
-        log_error("image: %s: no memory for %d x %d pixels of %d channels", file->name, width, height,
-                  n_channels);
+        log_error("image: %s: no memory for %d x %d pixels of %d channels", file->name, width,
+                  height, n_channels);
     return err;
 }
 
@@ -98,16 +102,17 @@ int image_read_memory(struct image *out, const struct image_file *file)
         return image_read_hdr(out, file);
     if (begins_with(file, "\x89PNG\r\n\x1a\n", 8))
         return image_read_png(out, file);
-    if (begins_with(file, "II*\0", 4) || begins_with(file, "MM\0*", 4) || begins_with(file, "II+\0", 4) ||
-        begins_with(file, "MM\0+", 4))
+    if (begins_with(file, "II*\0", 4) || begins_with(file, "MM\0*", 4) ||
+        begins_with(file, "II+\0", 4) || begins_with(file, "MM\0+", 4))
         return image_read_tiff(out, file);
     if (file->n_bytes == 0) {
         log_error("image: %s: the file is empty", file->name);
         return -EINVAL;
     }
     log_error("image: %s: found neither OpenEXR, Radiance .hdr, TIFF nor PNG: %s", file->name,
-              begins_with(file, "\xff\xd8\xff", 3) ? "a JPEG is not linear; develop the raw file to EXR or TIFF"
-                                                   : "export it as one of these");
+              begins_with(file, "\xff\xd8\xff", 3)
+                  ? "a JPEG is not linear; develop the raw file to EXR or TIFF"
+                  : "export it as one of these");
     return -EINVAL;
 }
 
@@ -151,7 +156,8 @@ int image_require_finite(const struct image *image, const char *const *names, co
                 first = i, first_channel = c;
     if (!n_bad)
         return 0;
-    log_error("image: %s: %lld values are NaN or infinite, the first in channel %s at column %d, row %d; repair "
+    log_error("image: %s: %lld values are NaN or infinite, the first in channel %s at column %d, "
+              "row %d; repair "
               "the picture or leave it out",
               path, (long long)n_bad, image->names[first_channel], (int)(first % image->width),
               (int)(first / image->width));
@@ -207,7 +213,8 @@ void image_bilinear(const struct image *image, double x_px, double y_px, float *
     const float *row0 = image->data + (int64_t)y0 * image->width * n;
     const float *row1 = image->data + (int64_t)y1 * image->width * n;
     for (int c = 0; c < n; c++) {
-        const double top = (1 - wx) * (double)row0[(int64_t)x0 * n + c] + wx * (double)row0[(int64_t)x1 * n + c];
+        const double top =
+            (1 - wx) * (double)row0[(int64_t)x0 * n + c] + wx * (double)row0[(int64_t)x1 * n + c];
         const double bottom =
             (1 - wx) * (double)row1[(int64_t)x0 * n + c] + wx * (double)row1[(int64_t)x1 * n + c];
         out[c] = (float)((1 - wy) * top + wy * bottom);

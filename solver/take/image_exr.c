@@ -1,7 +1,9 @@
-// solver/take/image_exr.c - OpenEXR in and out, through the C core library (which appears only here).
+// solver/take/image_exr.c - OpenEXR in and out, through the C core library (which appears only
+// here).
 //
-// The library parses headers, finds chunks and (de)compresses them; samples are placed and converted here, so that every index is
-// checked by our own arithmetic and half <-> float is ours: nearest even, saturating.
+// The library parses headers, finds chunks and (de)compresses them; samples are placed and
+// converted here, so that every index is checked by our own arithmetic and half <-> float is ours:
+// nearest even, saturating.
 #include "solver/take/atomic_file.h"
 #include "solver/take/image_formats.h"
 #include "solver/take/log.h"
@@ -13,12 +15,14 @@
 #include <string.h>
 #include <unistd.h>
 
-// The core library itself refuses larger sides: keeps its 32-bit arithmetic far from overflow. Ours are smaller (image.h).
+// The core library itself refuses larger sides: keeps its 32-bit arithmetic far from overflow. Ours
+// are smaller (image.h).
 enum { LIBRARY_MAX_SIDE_PX = 1 << 24 };
 
 static float float_from_half(uint16_t h)
 {
-    const uint32_t sign = (uint32_t)(h & 0x8000) << 16, exponent = h >> 10 & 31, mantissa = h & 0x3ff;
+    const uint32_t sign = (uint32_t)(h & 0x8000) << 16, exponent = h >> 10 & 31,
+                   mantissa = h & 0x3ff;
     union {
         uint32_t bits;
         float value;
@@ -48,7 +52,8 @@ static uint16_t half_from_float(float value)
     if (magnitude < 0x33000000) // below 2^-25: rounds to 0
         return (uint16_t)sign;
     if (magnitude < 0x38800000) { // below 2^-14: a subnormal half
-        const uint32_t mantissa = (magnitude & 0x7fffff) | 0x800000, shift = 126 - (magnitude >> 23);
+        const uint32_t mantissa = (magnitude & 0x7fffff) | 0x800000,
+                       shift = 126 - (magnitude >> 23);
         h = mantissa >> shift;
         rest = mantissa & ((1u << shift) - 1);
         tie = 1u << (shift - 1);
@@ -61,7 +66,7 @@ static uint16_t half_from_float(float value)
     return (uint16_t)(sign | h);
 }
 
-// ---- what both directions share -------------------------------------------------------------------------------------------
+// ---- what both directions share -------------------------------------------------------------
 
 struct stream {
     const struct image_file *file; // reading
@@ -86,7 +91,7 @@ static int errno_of(exr_result_t code)
     return code == EXR_ERR_OUT_OF_MEMORY ? -ENOMEM : -EINVAL;
 }
 
-// ---- reading --------------------------------------------------------------------------------------------------------------
+// ---- reading --------------------------------------------------------------------------------
 
 struct reader {
     struct stream stream;
@@ -98,13 +103,14 @@ struct reader {
     int64_t chunk_x, chunk_y;       // first pixel of the chunk in hand
 };
 
-static int64_t read_bytes(exr_const_context_t context, void *user, void *buffer, uint64_t n, uint64_t offset,
-                          exr_stream_error_func_ptr_t complain)
+static int64_t read_bytes(exr_const_context_t context, void *user, void *buffer, uint64_t n,
+                          uint64_t offset, exr_stream_error_func_ptr_t complain)
 {
     const struct stream *s = user;
     const uint64_t size = s->file->n_bytes;
     if (offset > size) {
-        complain(context, EXR_ERR_READ_IO, "offset %llu lies beyond the end", (unsigned long long)offset);
+        complain(context, EXR_ERR_READ_IO, "offset %llu lies beyond the end",
+                 (unsigned long long)offset);
         return -1;
     }
     if (n > size - offset)
@@ -148,12 +154,15 @@ static int check_kind(const struct reader *r)
         return -EINVAL;
     }
     if (n_parts != 1) {
-        log_error("image: %s: found %d parts, expected a single-part EXR; save the part you need to its own file",
+        log_error("image: %s: found %d parts, expected a single-part EXR; save the part you need "
+                  "to its own file",
                   name, n_parts);
         return -ENOTSUP;
     }
     if (storage != EXR_STORAGE_SCANLINE && storage != EXR_STORAGE_TILED) {
-        log_error("image: %s: found deep pixels, expected a flat EXR; flatten it and re-save as ZIP", name);
+        log_error(
+            "image: %s: found deep pixels, expected a flat EXR; flatten it and re-save as ZIP",
+            name);
         return -ENOTSUP;
     }
     const char *bad = unreadable_compression(compression);
@@ -181,7 +190,8 @@ static int check_channels(const struct reader *r, int *stored_bytes)
             return -ENOTSUP;
         }
         if (channel->x_sampling != 1 || channel->y_sampling != 1) {
-            log_error("image: %s: channel %s is subsampled (%d x %d), expected every channel at full size; "
+            log_error("image: %s: channel %s is subsampled (%d x %d), expected every channel at "
+                      "full size; "
                       "re-save as RGB",
                       name, channel->name.str, channel->x_sampling, channel->y_sampling);
             return -ENOTSUP;
@@ -219,7 +229,8 @@ static void order_channels(struct reader *r, const char *names[IMAGE_MAX_CHANNEL
 }
 
 // Little-endian samples of one channel in one row.
-static void convert_row(const uint8_t *from, exr_pixel_type_t type, float *to, int64_t n, int stride)
+static void convert_row(const uint8_t *from, exr_pixel_type_t type, float *to, int64_t n,
+                        int stride)
 {
     if (type == EXR_PIXEL_HALF) {
         for (int64_t i = 0; i < n; i++)
@@ -230,7 +241,8 @@ static void convert_row(const uint8_t *from, exr_pixel_type_t type, float *to, i
         union {
             uint32_t bits;
             float value;
-        } f = { (uint32_t)from[0] | (uint32_t)from[1] << 8 | (uint32_t)from[2] << 16 | (uint32_t)from[3] << 24 };
+        } f = { (uint32_t)from[0] | (uint32_t)from[1] << 8 | (uint32_t)from[2] << 16 |
+                (uint32_t)from[3] << 24 };
         to[i * stride] = type == EXR_PIXEL_FLOAT ? f.value : (float)f.bits;
     }
 }
@@ -251,7 +263,8 @@ static exr_result_t place_chunk(exr_decode_pipeline_t *decode)
         decode->chunk.unpacked_size != (uint64_t)width * (uint64_t)height * pixel_bytes)
         return EXR_ERR_CORRUPT_CHUNK;
     // In the display window; what falls outside is dropped.
-    const int64_t x0 = r->chunk_x - r->display_window.min.x, y0 = r->chunk_y - r->display_window.min.y;
+    const int64_t x0 = r->chunk_x - r->display_window.min.x,
+                  y0 = r->chunk_y - r->display_window.min.y;
     const int64_t skip = x0 < 0 ? (-x0 < width ? -x0 : width) : 0;
     int64_t n = x0 + width <= image->width ? width - skip : image->width - x0 - skip;
     if (n < 0)
@@ -263,8 +276,9 @@ static exr_result_t place_chunk(exr_decode_pipeline_t *decode)
             const int64_t sample_bytes = type == EXR_PIXEL_HALF ? 2 : 4;
             if (y >= 0 && y < image->height && n > 0)
                 convert_row(from + skip * sample_bytes, type,
-                            image->data + (y * image->width + x0 + skip) * image->n_channels + r->target[c], n,
-                            image->n_channels);
+                            image->data + (y * image->width + x0 + skip) * image->n_channels +
+                                r->target[c],
+                            n, image->n_channels);
             from += width * sample_bytes;
         }
     }
@@ -285,10 +299,13 @@ static exr_result_t decode_chunk(struct reader *r, exr_decode_pipeline_t *decode
     return exr_decoding_run(r->context, 0, decode);
 }
 
-static int chunk_failed(const struct reader *r, const char *kind, int64_t x, int64_t y, exr_result_t code)
+static int chunk_failed(const struct reader *r, const char *kind, int64_t x, int64_t y,
+                        exr_result_t code)
 {
-    const char *why = r->stream.message[0] ? r->stream.message : exr_get_default_error_message(code);
-    log_error("image: %s: %s at column %lld, row %lld: %s: the file is broken or cut short; copy or render it again",
+    const char *why =
+        r->stream.message[0] ? r->stream.message : exr_get_default_error_message(code);
+    log_error("image: %s: %s at column %lld, row %lld: %s: the file is broken or cut short; copy "
+              "or render it again",
               r->stream.file->name, kind, (long long)x, (long long)y, why);
     return errno_of(code);
 }
@@ -301,10 +318,12 @@ static int read_scanlines(struct reader *r, exr_decode_pipeline_t *decode)
         return chunk_failed(r, "lines", r->data_window.min.x, r->data_window.min.y, code);
     for (int64_t y = r->data_window.min.y; y <= r->data_window.max.y; y += step) {
         exr_chunk_info_t chunk;
-        const int64_t expected = r->data_window.max.y - y + 1 < step ? r->data_window.max.y - y + 1 : step;
+        const int64_t expected =
+            r->data_window.max.y - y + 1 < step ? r->data_window.max.y - y + 1 : step;
         code = exr_read_scanline_chunk_info(r->context, 0, (int)y, &chunk);
         if (code == EXR_ERR_SUCCESS &&
-            (chunk.width != (int64_t)r->data_window.max.x - r->data_window.min.x + 1 || chunk.height != expected))
+            (chunk.width != (int64_t)r->data_window.max.x - r->data_window.min.x + 1 ||
+             chunk.height != expected))
             code = EXR_ERR_CORRUPT_CHUNK;
         r->chunk_x = r->data_window.min.x;
         r->chunk_y = y;
@@ -329,9 +348,10 @@ static int read_tiles(struct reader *r, exr_decode_pipeline_t *decode)
             exr_chunk_info_t chunk;
             const int64_t expected_width = width - x < tile_width ? width - x : tile_width;
             const int64_t expected_height = height - y < tile_height ? height - y : tile_height;
-            code = exr_read_tile_chunk_info(r->context, 0, (int)(x / tile_width), (int)(y / tile_height), 0, 0,
-                                            &chunk);
-            if (code == EXR_ERR_SUCCESS && (chunk.width != expected_width || chunk.height != expected_height))
+            code = exr_read_tile_chunk_info(r->context, 0, (int)(x / tile_width),
+                                            (int)(y / tile_height), 0, 0, &chunk);
+            if (code == EXR_ERR_SUCCESS &&
+                (chunk.width != expected_width || chunk.height != expected_height))
                 code = EXR_ERR_CORRUPT_CHUNK;
             r->chunk_x = r->data_window.min.x + x;
             r->chunk_y = r->data_window.min.y + y;
@@ -372,7 +392,8 @@ int image_read_exr(struct image *out, const struct image_file *file)
     err = check_kind(&r);
     if (err)
         goto fail;
-    if (exr_get_storage(r.context, 0, &storage) || exr_get_data_window(r.context, 0, &r.data_window) ||
+    if (exr_get_storage(r.context, 0, &storage) ||
+        exr_get_data_window(r.context, 0, &r.data_window) ||
         exr_get_display_window(r.context, 0, &r.display_window) ||
         exr_get_channels(r.context, 0, &r.channels)) {
         log_error("image: %s: broken EXR header: windows or channels are missing", file->name);
@@ -383,17 +404,19 @@ int image_read_exr(struct image *out, const struct image_file *file)
     if (err)
         goto fail;
     const exr_attr_box2i_t *data = &r.data_window, *display = &r.display_window;
-    err = image_check_size(file, (int64_t)data->max.x - data->min.x + 1, (int64_t)data->max.y - data->min.y + 1,
-                           r.channels->num_channels, stored_bytes);
+    err = image_check_size(file, (int64_t)data->max.x - data->min.x + 1,
+                           (int64_t)data->max.y - data->min.y + 1, r.channels->num_channels,
+                           stored_bytes);
     if (!err)
         err = image_check_size(file, (int64_t)display->max.x - display->min.x + 1,
-                               (int64_t)display->max.y - display->min.y + 1, r.channels->num_channels,
-                               stored_bytes);
+                               (int64_t)display->max.y - display->min.y + 1,
+                               r.channels->num_channels, stored_bytes);
     if (err)
         goto fail;
     order_channels(&r, names);
     err = image_new_for(&image, file, (int)((int64_t)display->max.x - display->min.x + 1),
-                        (int)((int64_t)display->max.y - display->min.y + 1), r.channels->num_channels, names);
+                        (int)((int64_t)display->max.y - display->min.y + 1),
+                        r.channels->num_channels, names);
     if (err)
         goto fail;
     err = storage == EXR_STORAGE_TILED ? read_tiles(&r, &decode) : read_scanlines(&r, &decode);
@@ -412,7 +435,7 @@ fail:
     return err;
 }
 
-// ---- writing --------------------------------------------------------------------------------------------------------------
+// ---- writing --------------------------------------------------------------------------------
 
 static int64_t write_bytes(exr_const_context_t context, void *user, const void *buffer, uint64_t n,
                            uint64_t offset, exr_stream_error_func_ptr_t complain)
@@ -420,7 +443,8 @@ static int64_t write_bytes(exr_const_context_t context, void *user, const void *
     struct stream *s = user;
     (void)context, (void)complain;
     for (uint64_t done = 0; done < n;) {
-        const ssize_t got = pwrite(s->fd, (const char *)buffer + done, n - done, (off_t)(offset + done));
+        const ssize_t got =
+            pwrite(s->fd, (const char *)buffer + done, n - done, (off_t)(offset + done));
         if (got < 0 && errno == EINTR)
             continue;
         if (got <= 0) {
@@ -447,7 +471,8 @@ static int refuse_nan(const struct image *image, const char *path)
     return 0;
 }
 
-// EXR wants channels in the order of their names: order[i] is the image's channel of the file's i-th.
+// EXR wants channels in the order of their names: order[i] is the image's channel of the file's
+// i-th.
 static int sort_channels(const struct image *image, const char *path, int order[IMAGE_MAX_CHANNELS])
 {
     for (int c = 0; c < image->n_channels; c++) {
@@ -548,7 +573,8 @@ int image_write_exr(const struct image *image, const char *path, enum image_type
     if (code == EXR_ERR_SUCCESS)
         code = exr_get_scanlines_per_chunk(context, 0, &step);
     if (code == EXR_ERR_SUCCESS && type == IMAGE_HALF) {
-        half = malloc((size_t)step * (size_t)image->width * (size_t)image->n_channels * sizeof(*half));
+        half =
+            malloc((size_t)step * (size_t)image->width * (size_t)image->n_channels * sizeof(*half));
         if (!half)
             code = EXR_ERR_OUT_OF_MEMORY;
     }

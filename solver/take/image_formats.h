@@ -1,4 +1,5 @@
-// solver/take/image_formats.h - what image*.c share: one decoder per format, each over a file that lies in memory.
+// solver/take/image_formats.h - what image*.c share: one decoder per format, each over a file that
+// lies in memory.
 //
 // Private to image*.c, their tests and the fuzzers.
 #pragma once
@@ -20,8 +21,9 @@ int image_read_hdr(struct image *out, const struct image_file *file);
 int image_read_png(struct image *out, const struct image_file *file);
 int image_read_tiff(struct image *out, const struct image_file *file);
 
-// 0, or -EINVAL / -EFBIG (logged) if a header asks for more than image.h allows. stored_bytes: of one pixel, all channels, as
-// the file stores it before compression. To be called before anything of that size is allocated.
+// 0, or -EINVAL / -EFBIG (logged) if a header asks for more than image.h allows. stored_bytes: of
+// one pixel, all channels, as the file stores it before compression. To be called before anything
+// of that size is allocated.
 int image_check_size(const struct image_file *file, int64_t width, int64_t height, int n_channels,
                      int stored_bytes);
 

@@ -1,7 +1,8 @@
-// solver/take/image_hdr.c - Radiance .hdr: a text header, then rows of R, G, B mantissas with one exponent.
+// solver/take/image_hdr.c - Radiance .hdr: a text header, then rows of R, G, B mantissas with one
+// exponent.
 //
-// As Radiance's own reader decodes: (mantissa + .5) * 2^(exponent - 136), exponent 0 is black; EXPOSURE and COLORCORR tell what
-// the values were multiplied by, so they are divided out.
+// As Radiance's own reader decodes: (mantissa + .5) * 2^(exponent - 136), exponent 0 is black;
+// EXPOSURE and COLORCORR tell what the values were multiplied by, so they are divided out.
 #include "solver/take/image_formats.h"
 #include "solver/take/log.h"
 
@@ -25,8 +26,8 @@ struct hdr {
 
 static int broken(const struct hdr *h, int row, const char *found)
 {
-    log_error("image: %s: row %d, byte %zu: %s: the file is broken or cut short", h->file->name, row, h->offset,
-              found);
+    log_error("image: %s: row %d, byte %zu: %s: the file is broken or cut short", h->file->name,
+              row, h->offset, found);
     return -EINVAL;
 }
 
@@ -55,8 +56,8 @@ static int multiply(const struct hdr *h, const char *line, double *factors, int 
         char *end;
         const double value = strtod_l(s, &end, h->c_locale);
         if (end == s || !isfinite(value) || value <= 0) {
-            log_error("image: %s:%d: found \"%s\", expected %d positive number%s", h->file->name, h->line, line, n,
-                      n > 1 ? "s" : "");
+            log_error("image: %s:%d: found \"%s\", expected %d positive number%s", h->file->name,
+                      h->line, line, n, n > 1 ? "s" : "");
             return -EINVAL;
         }
         factors[i] *= value;
@@ -72,14 +73,16 @@ static int read_header(struct hdr *h)
     int err = 0;
     for (;;) {
         if (!next_line(h, line)) {
-            log_error("image: %s:%d: the Radiance header does not end: expected lines below %d bytes, then an empty one",
+            log_error("image: %s:%d: the Radiance header does not end: expected lines below %d "
+                      "bytes, then an empty one",
                       h->file->name, h->line + 1, MAX_LINE);
             return -EINVAL;
         }
         if (!line[0])
             break;
         if (!strncmp(line, "FORMAT=", 7) && strcmp(line + 7, "32-bit_rle_rgbe")) {
-            log_error("image: %s:%d: found %s, expected FORMAT=32-bit_rle_rgbe; convert the picture to RGB "
+            log_error("image: %s:%d: found %s, expected FORMAT=32-bit_rle_rgbe; convert the "
+                      "picture to RGB "
                       "(Radiance: ra_xyze -r)",
                       h->file->name, h->line, line);
             return -ENOTSUP;
@@ -101,22 +104,25 @@ static int read_resolution(struct hdr *h)
     char line[MAX_LINE], axis[2];
     int size[2], used = 0;
     if (!next_line(h, line)) {
-        log_error("image: %s:%d: the file ends before the line with its size (\"-Y height +X width\")", h->file->name,
-                  h->line + 1);
+        log_error(
+            "image: %s:%d: the file ends before the line with its size (\"-Y height +X width\")",
+            h->file->name, h->line + 1);
         return -EINVAL;
     }
     char sign[2];
-    const int n = sscanf(line, "%c%c %9d %c%c %9d%n", &sign[0], &axis[0], &size[0], &sign[1], &axis[1], &size[1],
-                         &used);
+    const int n = sscanf(line, "%c%c %9d %c%c %9d%n", &sign[0], &axis[0], &size[0], &sign[1],
+                         &axis[1], &size[1], &used);
     const bool is_size = n == 6 && line[used] == 0 && (sign[0] == '-' || sign[0] == '+') &&
                          (sign[1] == '-' || sign[1] == '+') &&
                          ((axis[0] == 'Y' && axis[1] == 'X') || (axis[0] == 'X' && axis[1] == 'Y'));
     if (!is_size) {
-        log_error("image: %s:%d: found \"%s\", expected \"-Y height +X width\"", h->file->name, h->line, line);
+        log_error("image: %s:%d: found \"%s\", expected \"-Y height +X width\"", h->file->name,
+                  h->line, line);
         return -EINVAL;
     }
     if (sign[0] != '-' || axis[0] != 'Y' || sign[1] != '+') {
-        log_error("image: %s:%d: orientation \"%c%c %c%c\" is not read, expected \"-Y +X\" (top row first); turn the "
+        log_error("image: %s:%d: orientation \"%c%c %c%c\" is not read, expected \"-Y +X\" (top "
+                  "row first); turn the "
                   "picture upright and save it again",
                   h->file->name, h->line, sign[0], axis[0], sign[1], axis[1]);
         return -ENOTSUP;
@@ -149,7 +155,8 @@ static int read_rle_row(struct hdr *h, int row, uint8_t (*rgbe)[4])
     return 0;
 }
 
-// One row of plain pixels; 1 1 1 n repeats the last pixel n times, the next such group counts n * 256, and so on.
+// One row of plain pixels; 1 1 1 n repeats the last pixel n times, the next such group counts n *
+// 256, and so on.
 static int read_plain_row(struct hdr *h, int row, uint8_t (*rgbe)[4])
 {
     int shift = 0;
@@ -163,7 +170,8 @@ static int read_plain_row(struct hdr *h, int row, uint8_t (*rgbe)[4])
         } else {
             const int64_t n = shift <= 16 ? (int64_t)p[3] << shift : INT64_MAX;
             if (x == 0 || n > h->width - x)
-                return broken(h, row, x ? "a repeat leaves its row" : "a repeat without a pixel before it");
+                return broken(h, row,
+                              x ? "a repeat leaves its row" : "a repeat without a pixel before it");
             for (int64_t i = 0; i < n; i++, x++)
                 memcpy(rgbe[x], rgbe[x - 1], 4);
             shift += 8;

@@ -1,6 +1,8 @@
-// solver/take/image_png.c - PNG: pictures for people and pages out, masks in (libpng appears only here).
+// solver/take/image_png.c - PNG: pictures for people and pages out, masks in (libpng appears only
+// here).
 //
-// libpng reports errors by longjmp: everything that lives across it sits in one struct outside the frame that jumps.
+// libpng reports errors by longjmp: everything that lives across it sits in one struct outside the
+// frame that jumps.
 #include "solver/take/atomic_file.h"
 #include "solver/take/image_formats.h"
 #include "solver/take/log.h"
@@ -34,7 +36,8 @@ static void keep_error(png_structp png, png_const_charp message)
 
 static void drop_warning(png_structp png, png_const_charp message)
 {
-    (void)png, (void)message; // "iCCP: known incorrect sRGB profile" and the like do not touch the pixels
+    (void)png,
+        (void)message; // "iCCP: known incorrect sRGB profile" and the like do not touch the pixels
 }
 
 static void write_bytes(png_structp png, png_bytep bytes, size_t n)
@@ -54,13 +57,15 @@ static void flush_nothing(png_structp png)
 
 static int encode(struct png_job *job, int width, int height, int n_channels, const uint8_t *pixels)
 {
-    static const int colour_types[] = { [1] = PNG_COLOR_TYPE_GRAY, [3] = PNG_COLOR_TYPE_RGB,
-                                        [4] = PNG_COLOR_TYPE_RGB_ALPHA };
+    static const int colour_types[] = {
+        [1] = PNG_COLOR_TYPE_GRAY, [3] = PNG_COLOR_TYPE_RGB, [4] = PNG_COLOR_TYPE_RGB_ALPHA
+    };
     if (setjmp(png_jmpbuf(job->png)))
         return -EIO;
     png_set_write_fn(job->png, job, write_bytes, flush_nothing);
-    png_set_IHDR(job->png, job->info, (png_uint_32)width, (png_uint_32)height, 8, colour_types[n_channels],
-                 PNG_INTERLACE_NONE, PNG_COMPRESSION_TYPE_DEFAULT, PNG_FILTER_TYPE_DEFAULT);
+    png_set_IHDR(job->png, job->info, (png_uint_32)width, (png_uint_32)height, 8,
+                 colour_types[n_channels], PNG_INTERLACE_NONE, PNG_COMPRESSION_TYPE_DEFAULT,
+                 PNG_FILTER_TYPE_DEFAULT);
     png_write_info(job->png, job->info);
     for (int y = 0; y < height; y++)
         png_write_row(job->png, pixels + (size_t)y * (size_t)width * (size_t)n_channels);
@@ -73,8 +78,9 @@ int image_write_png(const char *path, int width, int height, int n_channels, con
     struct atomic_file f;
     struct png_job job = { 0 };
     if (width < 1 || height < 1 || (n_channels != 1 && n_channels != 3 && n_channels != 4)) {
-        log_error("image: %s not written: a PNG of %d x %d pixels and %d channels; expected 1, 3 or 4 channels", path,
-                  width, height, n_channels);
+        log_error("image: %s not written: a PNG of %d x %d pixels and %d channels; expected 1, 3 "
+                  "or 4 channels",
+                  path, width, height, n_channels);
         return -EINVAL;
     }
     int err = atomic_file_open(&f, path);
@@ -88,7 +94,9 @@ int image_write_png(const char *path, int width, int height, int n_channels, con
     if (err) {
         err = job.write_err ? job.write_err : err;
         log_error("image: cannot write %s: %s", path,
-                  job.write_err ? strerror(-job.write_err) : job.message[0] ? job.message : strerror(-err));
+                  job.write_err    ? strerror(-job.write_err)
+                  : job.message[0] ? job.message
+                                   : strerror(-err));
         atomic_file_abandon(&f);
         return err;
     }
@@ -135,7 +143,8 @@ static void convert(const struct png_job *job, struct image *image, int depth)
         const uint8_t *from = job->rows[y];
         float *to = image->data + (size_t)y * n_row;
         for (size_t i = 0; i < n_row; i++)
-            to[i] = depth == 16 ? (float)(from[2 * i] << 8 | from[2 * i + 1]) / 65535 : (float)from[i] / 255;
+            to[i] = depth == 16 ? (float)(from[2 * i] << 8 | from[2 * i + 1]) / 65535
+                                : (float)from[i] / 255;
     }
 }
 

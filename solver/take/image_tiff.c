@@ -1,4 +1,5 @@
-// solver/take/image_tiff.c - TIFF in: linear 8/16-bit and float pictures from raw developers (libtiff appears only here).
+// solver/take/image_tiff.c - TIFF in: linear 8/16-bit and float pictures from raw developers
+// (libtiff appears only here).
 #include "solver/take/image_formats.h"
 #include "solver/take/log.h"
 
@@ -19,7 +20,7 @@ struct tiff {
     bool separate; // one plane per sample
 };
 
-// ---- a file in memory -----------------------------------------------------------------------------------------------------
+// ---- a file in memory -----------------------------------------------------------------------
 
 static tmsize_t read_bytes(thandle_t user, void *buffer, tmsize_t n)
 {
@@ -41,7 +42,9 @@ static tmsize_t write_nothing(thandle_t user, void *buffer, tmsize_t n)
 static toff_t seek(thandle_t user, toff_t offset, int whence)
 {
     struct tiff *t = user;
-    t->offset = offset + (whence == SEEK_CUR ? t->offset : whence == SEEK_END ? t->file->n_bytes : 0);
+    t->offset = offset + (whence == SEEK_CUR   ? t->offset
+                          : whence == SEEK_END ? t->file->n_bytes
+                                               : 0);
     return t->offset;
 }
 
@@ -67,7 +70,8 @@ static void unmap_nothing(thandle_t user, void *base, toff_t size)
     (void)user, (void)base, (void)size;
 }
 
-static int keep_error(TIFF *handle, void *user, const char *module, const char *format, va_list args)
+static int keep_error(TIFF *handle, void *user, const char *module, const char *format,
+                      va_list args)
 {
     struct tiff *t = user;
     (void)handle, (void)module;
@@ -76,7 +80,8 @@ static int keep_error(TIFF *handle, void *user, const char *module, const char *
     return 1;
 }
 
-static int pass_warning(TIFF *handle, void *user, const char *module, const char *format, va_list args)
+static int pass_warning(TIFF *handle, void *user, const char *module, const char *format,
+                        va_list args)
 {
     const struct tiff *t = user;
     char message[200];
@@ -94,14 +99,16 @@ static TIFF *open_memory(struct tiff *t)
     TIFFOpenOptionsSetErrorHandlerExtR(options, keep_error, t);
     TIFFOpenOptionsSetWarningHandlerExtR(options, pass_warning, t);
     // No tag of a sound file is larger than the file; strips and tiles are checked by us.
-    TIFFOpenOptionsSetMaxSingleMemAlloc(options, (tmsize_t)(t->file->n_bytes * 1200 + ((uint64_t)64 << 20)));
-    TIFF *handle = TIFFClientOpenExt(t->file->name, "rm", t, read_bytes, write_nothing, seek, close_nothing,
-                                     count_bytes, map_nothing, unmap_nothing, options);
+    TIFFOpenOptionsSetMaxSingleMemAlloc(options,
+                                        (tmsize_t)(t->file->n_bytes * 1200 + ((uint64_t)64 << 20)));
+    TIFF *handle =
+        TIFFClientOpenExt(t->file->name, "rm", t, read_bytes, write_nothing, seek, close_nothing,
+                          count_bytes, map_nothing, unmap_nothing, options);
     TIFFOpenOptionsFree(options);
     return handle;
 }
 
-// ---- what is in it --------------------------------------------------------------------------------------------------------
+// ---- what is in it --------------------------------------------------------------------------
 
 static int broken(const struct tiff *t, const char *what)
 {
@@ -112,8 +119,8 @@ static int broken(const struct tiff *t, const char *what)
 
 static int refuse(const struct tiff *t, const char *what, int found, const char *expected)
 {
-    log_error("image: %s: TIFF with %s %d, expected %s; export it as 16-bit linear RGB or as EXR", t->file->name, what,
-              found, expected);
+    log_error("image: %s: TIFF with %s %d, expected %s; export it as 16-bit linear RGB or as EXR",
+              t->file->name, what, found, expected);
     return -ENOTSUP;
 }
 
@@ -135,7 +142,8 @@ static bool is_readable_compression(uint16_t compression)
 
 static int read_header(struct tiff *t)
 {
-    uint16_t photometric = PHOTOMETRIC_MINISBLACK, planes = PLANARCONFIG_CONTIG, compression = COMPRESSION_NONE;
+    uint16_t photometric = PHOTOMETRIC_MINISBLACK, planes = PLANARCONFIG_CONTIG,
+             compression = COMPRESSION_NONE;
     uint16_t orientation = ORIENTATION_TOPLEFT;
     if (!TIFFGetField(t->handle, TIFFTAG_IMAGEWIDTH, &t->width) ||
         !TIFFGetField(t->handle, TIFFTAG_IMAGELENGTH, &t->height))
@@ -151,19 +159,23 @@ static int read_header(struct tiff *t)
     t->separate = planes == PLANARCONFIG_SEPARATE;
 
     if (photometric != PHOTOMETRIC_MINISBLACK && photometric != PHOTOMETRIC_RGB)
-        return refuse(t, "photometric interpretation", photometric, "1 (grey, black is 0) or 2 (RGB)");
+        return refuse(t, "photometric interpretation", photometric,
+                      "1 (grey, black is 0) or 2 (RGB)");
     if (photometric == PHOTOMETRIC_RGB ? t->n_samples != 3 && t->n_samples != 4 : t->n_samples != 1)
         return refuse(t, "samples per pixel", t->n_samples, "1 (grey), 3 (RGB) or 4 (RGBA)");
     const bool integer = t->format == SAMPLEFORMAT_UINT && (t->bits == 8 || t->bits == 16);
     const bool real = t->format == SAMPLEFORMAT_IEEEFP && t->bits == 32;
     if (!integer && !real)
-        return refuse(t, t->format == SAMPLEFORMAT_IEEEFP ? "float bits per sample" : "bits per sample", t->bits,
-                      "8 or 16 (unsigned integer) or 32 (float)");
+        return refuse(
+            t, t->format == SAMPLEFORMAT_IEEEFP ? "float bits per sample" : "bits per sample",
+            t->bits, "8 or 16 (unsigned integer) or 32 (float)");
     if (!is_readable_compression(compression))
-        return refuse(t, "compression", compression, "none, LZW, deflate, PackBits, Zstandard or LZMA");
+        return refuse(t, "compression", compression,
+                      "none, LZW, deflate, PackBits, Zstandard or LZMA");
     if (orientation != ORIENTATION_TOPLEFT)
-        log_warning("image: %s: orientation tag %d is ignored: pixels are taken as they lie in the file", t->file->name,
-                    orientation);
+        log_warning(
+            "image: %s: orientation tag %d is ignored: pixels are taken as they lie in the file",
+            t->file->name, orientation);
     return image_check_size(t->file, t->width, t->height, t->n_samples, t->n_samples * t->bits / 8);
 }
 
@@ -187,7 +199,8 @@ static int read_strips(const struct tiff *t, struct image *image)
 {
     char place[64];
     const size_t n_samples = t->n_samples, n_planes = t->separate ? n_samples : 1;
-    const size_t n_row = (size_t)t->width * (t->separate ? 1 : n_samples), row_bytes = n_row * t->bits / 8;
+    const size_t n_row = (size_t)t->width * (t->separate ? 1 : n_samples),
+                 row_bytes = n_row * t->bits / 8;
     if (TIFFScanlineSize64(t->handle) != row_bytes)
         return broken(t, "rows of another size than the header says");
     uint8_t *row = calloc(1, row_bytes);
@@ -217,9 +230,11 @@ static int read_tiles(const struct tiff *t, struct image *image)
     const size_t n_in_tile = t->separate ? 1 : n_samples, sample_bytes = t->bits / 8;
     TIFFGetField(t->handle, TIFFTAG_TILEWIDTH, &tile_width);
     TIFFGetField(t->handle, TIFFTAG_TILELENGTH, &tile_height);
-    if (tile_width < 1 || tile_height < 1 || tile_width > MAX_TILE_SIDE_PX || tile_height > MAX_TILE_SIDE_PX)
+    if (tile_width < 1 || tile_height < 1 || tile_width > MAX_TILE_SIDE_PX ||
+        tile_height > MAX_TILE_SIDE_PX)
         return broken(t, "tile size out of range");
-    int err = image_check_size(t->file, tile_width, tile_height, t->n_samples, (int)(n_in_tile * sample_bytes));
+    int err = image_check_size(t->file, tile_width, tile_height, t->n_samples,
+                               (int)(n_in_tile * sample_bytes));
     if (err)
         return err;
     const size_t row_bytes = tile_width * n_in_tile * sample_bytes;

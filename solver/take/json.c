@@ -13,8 +13,8 @@
 
 enum { MAX_FILE_BYTES = 256 << 20, MAX_INDEX_DIGITS = 9 };
 
-// A tree that lost a part for want of memory must never reach the disk. Which tree it was cannot be noted in the tree, so from then
-// on none is written.
+// A tree that lost a part for want of memory must never reach the disk. Which tree it was cannot be
+// noted in the tree, so from then on none is written.
 static atomic_bool out_of_memory;
 
 static json_t *value_of(const struct json *v)
@@ -32,7 +32,8 @@ int json_parse(struct json **out, const char *text, size_t n_bytes, const char *
     json_error_t error;
     *out = NULL;
     if (n_bytes > MAX_FILE_BYTES) {
-        log_error("json: %s: %zu bytes, at most %d are read", name_for_errors, n_bytes, MAX_FILE_BYTES);
+        log_error("json: %s: %zu bytes, at most %d are read", name_for_errors, n_bytes,
+                  MAX_FILE_BYTES);
         return -EFBIG;
     }
     json_t *v = json_loadb(text, n_bytes, JSON_REJECT_DUPLICATES, &error);
@@ -210,8 +211,8 @@ int json_get_numbers(const struct json *doc, const char *path, double *out, int 
     return err;
 }
 
-static int complain(const struct json *doc, const char *path, const char *file, const char *expected,
-                    int err)
+static int complain(const struct json *doc, const char *path, const char *file,
+                    const char *expected, int err)
 {
     const json_t *v = value_of(json_get(doc, path));
     char *found = v ? json_dumps(v, JSON_COMPACT | JSON_ENCODE_ANY) : NULL;
@@ -222,7 +223,8 @@ static int complain(const struct json *doc, const char *path, const char *file, 
     return err;
 }
 
-int json_require_numbers(const struct json *doc, const char *path, double *out, int n, const char *file)
+int json_require_numbers(const struct json *doc, const char *path, double *out, int n,
+                         const char *file)
 {
     const int err = json_get_numbers(doc, path, out, n);
     if (!err)
@@ -232,7 +234,8 @@ int json_require_numbers(const struct json *doc, const char *path, double *out, 
     return complain(doc, path, file, expected, err);
 }
 
-int json_require_string(const struct json *doc, const char *path, const char **out, const char *file)
+int json_require_string(const struct json *doc, const char *path, const char **out,
+                        const char *file)
 {
     const int err = json_get_string(doc, path, out);
     return err ? complain(doc, path, file, "a string", err) : 0;

@@ -1,7 +1,7 @@
 // solver/take/log.c - one line per event: stderr in text or JSON, and a hook for tests.
 //
-// A line is made whole in memory and written by one call, so lines of several threads never mix. File names come from outside: bytes
-// that would break a line or a terminal are replaced.
+// A line is made whole in memory and written by one call, so lines of several threads never mix.
+// File names come from outside: bytes that would break a line or a terminal are replaced.
 #include "solver/take/log.h"
 
 #include <pthread.h>
@@ -140,9 +140,9 @@ void log_line(enum log_level level, const char *format, ...)
         }
         if (out && fclose(out) == 0)
             write_stderr(line, n_line);
-        if (hook_function)
-            hook_function(hook_arg, level, text);
     }
+    if (hook_function)
+        hook_function(hook_arg, level, text);
     pthread_mutex_unlock(&lock);
     free(line);
     free(message);

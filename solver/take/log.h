@@ -10,11 +10,11 @@
 enum log_level { LOG_DEBUG, LOG_INFO, LOG_WARNING, LOG_ERROR, LOG_SILENT }; // LOG_SILENT: only for log_set_level
 
 void log_set_program(const char *name); // kept; a literal
-void log_set_level(enum log_level least); // LOG_INFO by default; what is below is dropped, also for the hook
+void log_set_level(enum log_level least); // LOG_INFO by default; stderr gets nothing below
 void log_set_json(bool json);
 
-// Tests read what was logged: every line also goes to hook(arg, ...) while it is set. NULL ends it. Calls do
-// not overlap; hook must not log.
+// Tests read what was logged: every line of any level also goes to hook(arg, ...) while it is set. NULL ends it. Calls do not
+// overlap; hook must not log.
 void log_set_hook(void (*hook)(void *arg, enum log_level level, const char *message), void *arg);
 
 void log_line(enum log_level level, const char *format, ...) __attribute__((format(printf, 2, 3)));

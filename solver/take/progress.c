@@ -34,7 +34,8 @@ void progress_set_fd(int fd)
     pthread_mutex_unlock(&lock);
 }
 
-// A reader that went away must not end hours of work: EPIPE instead of SIGPIPE, and silence from then on.
+// A reader that went away must not end hours of work: EPIPE instead of SIGPIPE, and silence from
+// then on.
 static void write_json_line(const char *line, size_t n)
 {
     sigset_t pipe_only, pending, old;
@@ -72,10 +73,10 @@ static void draw(int64_t now)
     if (json_fd >= 0) {
         // Milliseconds as integers: %f would follow the locale.
         const int64_t ms = (now - begin_ns) / 1000000;
-        const int length = snprintf(line, sizeof(line),
-                                    "{\"stage\":\"%s\",\"done\":%lld,\"total\":%lld,\"seconds\":%lld.%03d}\n",
-                                    stage, (long long)n, (long long)total, (long long)(ms / 1000),
-                                    (int)(ms % 1000));
+        const int length = snprintf(
+            line, sizeof(line),
+            "{\"stage\":\"%s\",\"done\":%lld,\"total\":%lld,\"seconds\":%lld.%03d}\n", stage,
+            (long long)n, (long long)total, (long long)(ms / 1000), (int)(ms % 1000));
         if (length > 0 && (size_t)length < sizeof(line))
             write_json_line(line, (size_t)length);
     }
@@ -90,8 +91,8 @@ static void draw(int64_t now)
     format_time(elapsed, sizeof(elapsed), seconds);
     if (share > 0)
         format_time(left, sizeof(left), seconds * (1 - share) / share);
-    fprintf(stderr, "\r\033[K%s [%s] %3d%%  %s elapsed, %s left", stage, bar, (int)(share * 100), elapsed,
-            left);
+    fprintf(stderr, "\r\033[K%s [%s] %3d%%  %s elapsed, %s left", stage, bar, (int)(share * 100),
+            elapsed, left);
     fflush(stderr);
 }
 

@@ -9,9 +9,9 @@
 struct take {
     char *dir;
     struct json *manifest;  // take.json, or NULL where there is none (a plain folder with the same pieces)
-    char *mesh_path;        // geometry/mesh.*; NULL: none yet
-    char *cameras_path;     // geometry/cameras (folder) or geometry/cameras.*; NULL: none yet
-    char *panorama_path;    // NULL: none yet
+    char *mesh_path;        // geometry/mesh.*; NULL: none yet; of several the first bytewise, with a warning
+    char *cameras_path;     // geometry/cameras (folder, not empty) or geometry/cameras.*; NULL: none yet
+    char *panorama_path;    // panorama.exr, else panorama.hdr; NULL: none yet
     char *linear_dir;       // NULL: none yet
     char *start_path;       // start.json: rough world_from_probe; NULL: none
     int n_views;
@@ -24,7 +24,7 @@ struct take {
 int take_open(struct take **out, const char *dir);
 void take_close(struct take *take); // NULL allowed
 
-// 0, or -ENOENT after logging which piece is missing and who makes it. needs: TAKE_MESH | ...
+// 0, or -ENOENT after logging each piece that is missing and who makes it. needs: TAKE_MESH | ...
 enum { TAKE_MESH = 1, TAKE_CAMERAS = 2, TAKE_PANORAMA = 4, TAKE_VIEWS = 8, TAKE_START = 16 };
 int take_require(const struct take *take, unsigned needs);
 

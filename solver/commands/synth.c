@@ -1,0 +1,192 @@
+// solver/commands/synth.c - rigsolve synth: a synthetic studio on disk, with its known answer.
+#include "solver/commands/commands.h"
+#include "solver/synth.h"
+#include "solver/take/json.h"
+#include "solver/take/log.h"
+
+#include <argp.h>
+#include <errno.h>
+#include <limits.h>
+#include <stdio.h>
+#include <stdlib.h>
+#include <string.h>
+
+enum {
+    KEY_SEED = 256,
+    KEY_LIGHTS,
+    KEY_NOISE,
+    KEY_SIZE,
+    KEY_VIEWS,
+    KEY_DIRECTIONAL,
+    KEY_UNIFORM,
+    KEY_MISSING,
+    KEY_SHAPE,
+    KEY_TEXTURE,
+    KEY_SAMPLES,
+    KEY_PANORAMA,
+    KEY_FLOAT,
+    KEY_THREADS,
+    KEY_JSON
+};
+
+static const struct argp_option options[] = {
+    {"output", 'o', "DIR", 0, "The folder to make (new or empty)", 0},
+    {"seed", KEY_SEED, "N", 0, "Jitter of the lights, rotation, lenses, noise (1)", 0},
+    {"true-lights", KEY_LIGHTS, "N", 0, "Point lights on the cuboid, 16 to 65536 (65536)", 0},
+    {"noise", KEY_NOISE, "S", 0, "Standard deviation of Gaussian noise, white = 1 (0)", 0},
+    {"size", KEY_SIZE, "WxH", 0, "Pixels of a view (360x240)", 0},
+    {"views", KEY_VIEWS, "N", 0, "How many views, on five rings (85)", 0},
+    {"samples", KEY_SAMPLES, "N", 0, "Rays per pixel and side (2)", 0},
+    {"texture", KEY_TEXTURE, "N", 0,
+     "Side of the true textures (D1, D2: 64; D3, D4: 512; D5: 2048)", 0},
+    {"panorama-width", KEY_PANORAMA, "N", 0, "Pixels (2048)", 0},
+    {"shape", KEY_SHAPE, "NAME", 0, "pebble, vase, knot or bowl instead of the data set's own", 0},
+    {"directional", KEY_DIRECTIONAL, 0, 0, "Render with all lights at infinity", 0},
+    {"uniform", KEY_UNIFORM, 0, 0, "All walls equally bright, no panels", 0},
+    {"missing-panel", KEY_MISSING, 0, 0, "Leave one panel out of the panorama (it still shines)",
+     0},
+    {"float", KEY_FLOAT, 0, 0, "Views as 32-bit floats instead of half", 0},
+    {"threads", KEY_THREADS, "N", 0, "Default: all cores. The result does not depend on it", 0},
+    {"json", KEY_JSON, 0, 0, "Print the report (truth/report.json) on standard output", 0},
+    {0},
+};
+
+struct arguments {
+    struct synth_settings settings; // data_set, texture_size: 0 until known
+    const char *dir;
+    bool json;
+};
+
+static long long number(struct argp_state *state, const char *option, const char *text,
+                        long long low, long long high)
+{
+    char *end;
+    const long long value = strtoll(text, &end, 10);
+    if (end == text || *end || value < low || value > high)
+        argp_error(state, "--%s: '%s' is not a whole number from %lld to %lld", option, text, low,
+                   high);
+    return value;
+}
+
+static error_t parse(int key, char *text, struct argp_state *state)
+{
+    struct arguments *a = state->input;
+    struct synth_settings *s = &a->settings;
+    char *end;
+    switch (key) {
+    case 'o':
+        a->dir = text;
+        return 0;
+    case KEY_SEED:
+        s->seed = (uint64_t)number(state, "seed", text, 0, LLONG_MAX);
+        return 0;
+    case KEY_LIGHTS:
+        s->n_true_lights = (int)number(state, "true-lights", text, 16, 65536);
+        return 0;
+    case KEY_NOISE:
+        s->noise = strtod(text, &end);
+        if (end == text || *end || !(s->noise >= 0 && s->noise <= 1))
+            argp_error(state, "--noise: '%s' is not a number from 0 to 1", text);
+        return 0;
+    case KEY_SIZE: {
+        int n = 0;
+        if (sscanf(text, "%4dx%4d%n", &s->width_px, &s->height_px, &n) != 2 || text[n] ||
+            s->width_px < 16 || s->height_px < 16 || s->width_px > 8192 || s->height_px > 8192)
+            argp_error(state, "--size: '%s' is not WxH, each from 16 to 8192 (360x240)", text);
+        return 0;
+    }
+    case KEY_VIEWS:
+        s->n_views = (int)number(state, "views", text, 1, 999);
+        return 0;
+    case KEY_SAMPLES:
+        s->samples = (int)number(state, "samples", text, 1, 16);
+        return 0;
+    case KEY_TEXTURE:
+        s->texture_size = (int)number(state, "texture", text, 32, 8192);
+        return 0;
+    case KEY_PANORAMA:
+        s->panorama_width_px = (int)number(state, "panorama-width", text, 32, 16384);
+        return 0;
+    case KEY_SHAPE:
+        s->shape = text;
+        return 0;
+    case KEY_DIRECTIONAL:
+        s->directional = true;
+        return 0;
+    case KEY_UNIFORM:
+        s->uniform_cuboid = true;
+        return 0;
+    case KEY_MISSING:
+        s->one_panel_missing_from_panorama = true;
+        return 0;
+    case KEY_FLOAT:
+        s->final_float = true;
+        return 0;
+    case KEY_THREADS:
+        s->n_threads = (int)number(state, "threads", text, 1, 256);
+        return 0;
+    case KEY_JSON:
+        a->json = true;
+        return 0;
+    case ARGP_KEY_ARG:
+        if (s->data_set || strlen(text) != 2 || (text[0] != 'D' && text[0] != 'd') ||
+            text[1] < '1' || text[1] > '5')
+            argp_error(state, "'%s' is not one of D1, D2, D3, D4, D5 (one of them)", text);
+        s->data_set = text[1] - '0';
+        return 0;
+    case ARGP_KEY_END:
+        if (!s->data_set)
+            argp_error(state, "which data set? One of D1, D2, D3, D4, D5");
+        if (!a->dir)
+            argp_error(state, "where to? -o DIR is needed");
+        return 0;
+    default:
+        return ARGP_ERR_UNKNOWN;
+    }
+}
+
+static const struct argp argp = {
+    options,
+    parse,
+    "D1|D2|D3|D4|D5 -o DIR",
+    "Make a synthetic studio: a take (views, mesh, cameras, panorama), its known answer in truth/, "
+    "and views under another "
+    "light in relit/.\v"
+    "Light comes from point lights on a cuboid of 3.6 x 2.4 x 1.2 m with four bright panels.\n"
+    "  D1  diffuse pebble at the light probe's place\n"
+    "  D2  the same, off centre\n"
+    "  D3  as D2 with a Disney material and a coloured, smooth albedo\n"
+    "  D4  D3's material on a knot, with shadows and one bounce\n"
+    "  D5  vase of four materials with sharp borders, with shadows\n"
+    "A view is clipped at 1, and says where in its channel 'clip'. truth/ is for judging only: "
+    "never give it to a solver.",
+    0,
+    0,
+    0,
+};
+
+int command_synth(int argc, char **argv)
+{
+    struct arguments a = {.settings = synth_defaults(0)};
+    a.settings.texture_size = 0;
+    argp_parse(&argp, argc, argv, 0, 0, &a);
+    if (!a.settings.texture_size)
+        a.settings.texture_size = synth_defaults(a.settings.data_set).texture_size;
+    const int err = synth_write(&a.settings, a.dir);
+    if (err == -ENOMEM)
+        log_error("synth: out of memory");
+    if (err)
+        return EXIT_FAILED;
+    if (!a.json)
+        return EXIT_DONE;
+    char path[PATH_MAX];
+    struct json *report;
+    if (snprintf(path, sizeof(path), "%s/truth/report.json", a.dir) >= (int)sizeof(path) ||
+        json_read(&report, path))
+        return EXIT_FAILED;
+    char *text = json_text(report);
+    json_free(report);
+    const bool printed = text && puts(text) >= 0 && !fflush(stdout);
+    free(text);
+    return printed ? EXIT_DONE : EXIT_FAILED;
+}

@@ -1,0 +1,503 @@
+// tests/check_kernels.c - every float kernel of this CPU against the double formulas, on random and on hard inputs.
+//
+// Errors are relative to the light that could arrive, sum V_i c_i of the channel, or to the sample's largest true entry where a lobe
+// makes that larger (a mirror gives 1e5 times what arrives, and float has 7 digits). Prints errors and times as TAP diagnostics.
+#include "solver/kernels/kernels.h"
+#include "solver/random.h"
+#include "solver/take/log.h"
+#include "solver/vec3.h"
+
+#include <math.h>
+#include <setjmp.h>
+#include <stdarg.h>
+#include <stddef.h>
+#include <stdint.h>
+#include <stdio.h>
+#include <stdlib.h>
+#include <string.h>
+#include <time.h>
+#include <cmocka.h>
+
+static const char *const names[] = { "reference", "portable", "avx2", "avx512" };
+enum { N_NAMES = sizeof(names) / sizeof(names[0]) };
+enum { N_VALUES = sizeof(struct shade_jacobian) / sizeof(float) };
+static const double max_bound = 1e-4, rms_bound = 1e-6;
+
+enum kind {
+    PLAIN, NEAR_FIELD, SOFT, HIDDEN, GRAZING_LIGHTS, GRAZING_VIEW, MIRROR, SHARP_MIRROR, CORNERS, BLACK, AT_HORIZON, BEHIND, MANY,
+    N_KINDS
+};
+static const char *const kind_names[N_KINDS] = {
+    "plain", "near field", "soft", "hidden", "grazing lights", "grazing view", "mirror", "sharp mirror", "0/1 parameters",
+    "black", "at the horizon", "behind", "many lights",
+};
+
+struct scene {
+    int n;
+    struct light_arrays lights;
+    struct lit lit;
+    uint16_t *visible;
+    uint8_t *soft;
+    struct surface_point surface;
+    struct shade_material material;
+    float v[3];
+    double truth[N_VALUES], irradiance[3], arriving[3], scale; // of brute force too, unless something is hidden
+};
+
+static uint64_t seed, draws;
+
+static double uniform(void)
+{
+    return random_uniform(seed, 1, draws++);
+}
+
+static void random_unit(double d[3])
+{
+    for (int c = 0; c < 3; c++)
+        d[c] = random_normal(seed, 2, draws++);
+    vec3_normalise(d);
+}
+
+static int channel_of(int value)
+{
+    return value < 3 ? value : value < 3 + 3 * DISNEY_N ? (value - 3) / DISNEY_N : (value - 3 - 3 * DISNEY_N) / 3;
+}
+
+// Eqs. 1-5 of the floats that the kernels are given, in double.
+static void find_truth(struct scene *s)
+{
+    struct disney m = { .variant = s->material.variant };
+    struct disney_frame frame;
+    double v[3];
+    for (int i = 0; i < DISNEY_N; i++)
+        m.theta[i] = (double)s->material.theta[i];
+    for (int c = 0; c < 3; c++) {
+        m.albedo[c] = (double)s->material.albedo[c], v[c] = (double)s->v[c];
+        frame.n[c] = (double)s->surface.normal[c], frame.x[c] = (double)s->surface.tangent[c];
+        frame.y[c] = (double)s->surface.bitangent[c];
+    }
+    const struct light_arrays *a = &s->lights;
+    for (int i = 0; i < s->n; i++) {
+        const double d[3] = { (double)a->dx[i], (double)a->dy[i], (double)a->dz[i] };
+        const double colour[3] = { (double)a->cr[i], (double)a->cg[i], (double)a->cb[i] };
+        double l[3];
+        for (int c = 0; c < 3; c++)
+            l[c] = d[c] + (double)a->q[i] * ((double)a->centre_m[c] - (double)s->surface.position_m[c]);
+        const double facing = vec3_dot(l, d), length = vec3_normalise(l);
+        const double bit = s->visible ? s->visible[i / 16] >> i % 16 & 1 : 1, share = s->soft ? s->soft[i] / 255. : 1;
+        const double unshadowed = fmax(facing, 0) / (length * length * length), weight = bit * share * unshadowed;
+        const double nl = fmax(vec3_dot(frame.n, l), 0);
+        struct disney_gradient g;
+        disney_eval_gradient(&m, &frame, l, v, &g);
+        const double *values = (const double *)&g; // f, theta, albedo first
+        for (int j = 0; j < N_VALUES; j++)
+            s->truth[j] += values[j] * nl * weight * colour[channel_of(j)];
+        for (int c = 0; c < 3; c++) {
+            s->arriving[c] += unshadowed * colour[c];
+            s->irradiance[c] += nl * bit * unshadowed * colour[c]; // irradiance() knows bits only
+        }
+    }
+    for (int j = 0; j < N_VALUES; j++)
+        s->scale = fmax(s->scale, fabs(s->truth[j]));
+}
+
+static void make_scene(struct scene *s, enum kind kind, uint64_t id)
+{
+    *s = (struct scene){ 0 };
+    seed = id, draws = 0;
+    static const int few[] = { 1, 2, 7, 8, 9, 15, 16, 17, 33, 100, 256, 300 };
+    const size_t count = kind == MANY ? 20000 + id % 16 : (size_t)few[id % 12];
+    s->n = (int)count;
+    const double near = kind == PLAIN || kind == SHARP_MIRROR ? 0 : .6;
+    struct lights lights = { .n = s->n, .dir_probe = calloc(count, sizeof(*lights.dir_probe)),
+                             .irradiance = calloc(count, sizeof(*lights.irradiance)),
+                             .inverse_distance = calloc(count, sizeof(double)) };
+    double n[3], x[3], y[3], v[3], w[3];
+    random_unit(w);
+    mat3_from_rotation_vector(lights.world_from_probe, w);
+    random_unit(n), random_unit(x);
+    vec3_add_scaled(x, x, -vec3_dot(x, n), n);
+    vec3_normalise(x);
+    vec3_cross(y, n, x);
+    do
+        random_unit(v);
+    while (vec3_dot(v, n) < .05);
+    if (kind == GRAZING_VIEW) { // nv from 1e-6 to .1
+        vec3_add_scaled(v, v, -vec3_dot(v, n) + pow(10, -1 - 5 * uniform()), n);
+        vec3_normalise(v);
+    }
+    double roughness = .05 + .95 * uniform();
+    if (kind == MIRROR || kind == SHARP_MIRROR)
+        roughness = kind == MIRROR ? .032 + .2 * uniform() : .06 * uniform();
+    for (int i = 0; i < DISNEY_N; i++)
+        s->material.theta[i] = (float)(kind == CORNERS ? uniform() < .5 : uniform());
+    if (kind != CORNERS)
+        s->material.theta[DISNEY_ROUGHNESS] = (float)roughness;
+    for (int c = 0; c < 3; c++) {
+        s->material.albedo[c] = kind == BLACK ? 0 : (float)uniform();
+        s->surface.normal[c] = (float)n[c], s->surface.tangent[c] = (float)x[c], s->surface.bitangent[c] = (float)y[c];
+        s->surface.position_m[c] = (float)(near * (uniform() - .5));
+        lights.centre_m[c] = near * (uniform() - .5);
+        s->v[c] = (float)v[c];
+    }
+    s->material.variant = id / 12 % 2 ? DISNEY_2012 : DISNEY_2017;
+    for (int i = 0; i < s->n; i++) {
+        double l[3];
+        random_unit(l);
+        const double nl = vec3_dot(l, n);
+        if (kind == GRAZING_LIGHTS) // from 1e-6 to .1, either side
+            vec3_add_scaled(l, l, -nl + (uniform() < .8 ? 1 : -1) * pow(10, -1 - 5 * uniform()), n);
+        else if (kind == AT_HORIZON)
+            vec3_add_scaled(l, l, -nl, n);
+        else if (kind == BEHIND) // some of them exactly opposite n
+            for (int c = 0; c < 3; c++)
+                l[c] = i % 3 ? l[c] - (nl > 0 ? 2 * nl : 0) * n[c] : -n[c];
+        else if ((kind == MIRROR || kind == SHARP_MIRROR) && i % 2 == 0) { // within a few alpha of the mirror direction
+            const double alpha = fmax(.001, roughness * roughness);
+            double h[3] = { n[0], n[1], n[2] };
+            vec3_add_scaled(h, h, alpha * random_normal(seed, 3, draws++), x);
+            vec3_add_scaled(h, h, alpha * random_normal(seed, 3, draws++), y);
+            vec3_normalise(h);
+            const double vh = vec3_dot(v, h);
+            for (int c = 0; c < 3; c++)
+                l[c] = 2 * vh * h[c] - v[c];
+        }
+        vec3_normalise(l);
+        mat3_tmul_vec(lights.dir_probe[i], lights.world_from_probe, l);
+        for (int c = 0; c < 3; c++)
+            lights.irradiance[i][c] = i % 11 == 5 ? 0 : uniform() / s->n;
+        lights.inverse_distance[i] = near > 0 && i % 5 ? 1.2 * uniform() : 0;
+    }
+    assert_int_equal(light_arrays_new(&s->lights, &lights), 0);
+    assert_int_equal(lit_new(&s->lit, s->n), 0);
+    free(lights.dir_probe);
+    free(lights.irradiance);
+    free(lights.inverse_distance);
+    if (kind == SOFT || kind == HIDDEN) {
+        s->visible = calloc((count + 15) / 16, sizeof(uint16_t));
+        for (int i = 0; i < s->n; i++)
+            s->visible[i / 16] |= (uint16_t)((uniform() < .6) << i % 16);
+    }
+    if (kind == SOFT) {
+        s->soft = calloc(count, 1); // no byte more: reading beyond shows under ASan
+        for (int i = 0; i < s->n; i++)
+            s->soft[i] = (uint8_t)random_u64(seed, 4, draws++);
+    }
+    find_truth(s);
+}
+
+static void free_scene(struct scene *s)
+{
+    light_arrays_free(&s->lights);
+    lit_free(&s->lit);
+    free(s->visible);
+    free(s->soft);
+}
+
+struct error {
+    double max, squares;
+    long n;
+};
+
+static void add_error(struct error *e, double difference, double scale)
+{
+    const double error = scale > 0 ? fabs(difference) / scale : fabs(difference);
+    e->max = error > e->max || isnan(error) ? error : e->max;
+    e->squares += error * error;
+    e->n++;
+}
+
+static void assert_small(const struct error *e, const char *kernel, const char *function, enum kind kind)
+{
+    const double rms = sqrt(e->squares / (double)e->n);
+    if (!(e->max <= max_bound && rms <= rms_bound))
+        fail_msg("%s %s, %s: max %.3g (bound %g), RMS %.3g (bound %g)", kernel, function, kind_names[kind], e->max, max_bound,
+                 rms, rms_bound);
+}
+
+enum function { SHADE, SHADE_JACOBIAN, BRUTE_JACOBIAN, IRRADIANCE, VIEWS, N_FUNCTIONS };
+static const char *const function_names[N_FUNCTIONS] = { "shade", "shade_jacobian", "brute_jacobian", "irradiance",
+                                                           "shade_views" };
+
+static void add_scene(struct error errors[N_FUNCTIONS], const struct kernels *k, struct scene *s)
+{
+    union {
+        struct shade_jacobian j;
+        float values[N_VALUES];
+    } shared, brute, views[3];
+    float L[3], E[3];
+    memset(&shared, 0xff, sizeof(shared)), memset(&brute, 0xff, sizeof(brute));
+    k->gather(&s->lit, &s->lights, &s->surface, s->visible, s->soft);
+    k->shade(L, &s->lit, &s->surface, s->v, &s->material);
+    k->shade_jacobian(&shared.j, &s->lit, &s->surface, s->v, &s->material);
+    // The middle one of three views, the last of them below the horizon.
+    const float v3[3][3] = { { s->surface.normal[0], s->surface.normal[1], s->surface.normal[2] },
+                             { s->v[0], s->v[1], s->v[2] },
+                             { -s->v[0], -s->v[1], -s->v[2] } };
+    memset(views, 0xff, sizeof(views));
+    k->shade_jacobian_views(&views[0].j, 3, &s->lit, &s->surface, v3, &s->material);
+    k->irradiance(E, &s->lights, &s->surface, s->visible);
+    const bool whole = !s->visible && !s->soft; // brute force knows no visibility
+    if (whole)
+        k->brute_jacobian(&brute.j, &s->lights, &s->surface, s->v, &s->material);
+    for (int j = 0; j < N_VALUES; j++) {
+        const double scale = fmax(s->arriving[channel_of(j)], s->scale);
+        add_error(&errors[SHADE_JACOBIAN], (double)shared.values[j] - s->truth[j], scale);
+        add_error(&errors[VIEWS], (double)views[1].values[j] - s->truth[j], scale);
+        assert_true(views[2].values[j] == 0);
+        if (whole)
+            add_error(&errors[BRUTE_JACOBIAN], (double)brute.values[j] - s->truth[j], scale);
+        if (j < 3)
+            add_error(&errors[SHADE], (double)L[j] - s->truth[j], fmax(s->arriving[j], s->truth[j]));
+        if (j < 3)
+            add_error(&errors[IRRADIANCE], (double)E[j] - s->irradiance[j], s->arriving[j]);
+    }
+}
+
+static void every_kernel_is_right_on_hard_inputs(void **state)
+{
+    (void)state;
+    for (int k = 0; k < N_NAMES; k++) {
+        const struct kernels *kernels = kernels_by_name(names[k]);
+        if (!kernels) {
+            printf("# %s: not on this CPU\n", names[k]);
+            continue;
+        }
+        assert_string_equal(kernels->name, names[k]);
+        struct error all[N_FUNCTIONS] = { 0 };
+        for (int kind = 0; kind < N_KINDS; kind++) {
+            struct error errors[N_FUNCTIONS] = { 0 };
+            for (uint64_t id = 0; id < (kind == MANY ? 2 : 120); id++) {
+                struct scene s;
+                make_scene(&s, (enum kind)kind, 1000 * (uint64_t)kind + id);
+                add_scene(errors, kernels, &s);
+                free_scene(&s);
+            }
+            for (int f = 0; f < N_FUNCTIONS; f++) {
+                if (errors[f].n)
+                    assert_small(&errors[f], names[k], function_names[f], (enum kind)kind);
+                all[f].max = fmax(all[f].max, errors[f].max);
+                all[f].squares += errors[f].squares, all[f].n += errors[f].n;
+            }
+        }
+        for (int f = 0; f < N_FUNCTIONS; f++)
+            printf("# %-9s %-14s max %.2g RMS %.2g\n", names[k], function_names[f], all[f].max,
+                   sqrt(all[f].squares / (double)all[f].n));
+    }
+}
+
+// What a solve meets: hundreds of lights, roughness from .3 up. Here the arriving light alone is the scale.
+static void ordinary_samples_are_right_to_the_arriving_light(void **state)
+{
+    (void)state;
+    for (int k = 0; k < N_NAMES; k++) {
+        const struct kernels *kernels = kernels_by_name(names[k]);
+        struct error error = { 0 };
+        for (uint64_t id = 0; kernels && id < 200; id++) {
+            struct scene s;
+            make_scene(&s, NEAR_FIELD, 50000 + 12 * id + 10); // 256 lights
+            s.material.theta[DISNEY_ROUGHNESS] = (float)(.3 + .7 * uniform());
+            memset(s.truth, 0, sizeof(s.truth)), memset(s.arriving, 0, sizeof(s.arriving));
+            find_truth(&s);
+            union {
+                struct shade_jacobian j;
+                float values[N_VALUES];
+            } out;
+            kernels->gather(&s.lit, &s.lights, &s.surface, NULL, NULL);
+            kernels->shade_jacobian(&out.j, &s.lit, &s.surface, s.v, &s.material);
+            for (int j = 0; j < N_VALUES; j++)
+                add_error(&error, (double)out.values[j] - s.truth[j], s.arriving[channel_of(j)]);
+            free_scene(&s);
+        }
+        if (kernels) {
+            printf("# %-9s to the arriving light: max %.2g RMS %.2g\n", names[k], error.max, sqrt(error.squares / (double)error.n));
+            assert_small(&error, names[k], "shade_jacobian", NEAR_FIELD);
+        }
+    }
+}
+
+static void what_one_kernel_gathers_another_may_shade(void **state)
+{
+    (void)state;
+    for (int from = 0; from < N_NAMES; from++)
+        for (int to = 0; to < N_NAMES; to++) {
+            const struct kernels *a = kernels_by_name(names[from]), *b = kernels_by_name(names[to]);
+            for (uint64_t id = 0; a && b && id < 24; id++) {
+                struct scene s;
+                float L[3];
+                make_scene(&s, SOFT, 70000 + id);
+                a->gather(&s.lit, &s.lights, &s.surface, s.visible, s.soft);
+                b->shade(L, &s.lit, &s.surface, s.v, &s.material);
+                for (int c = 0; c < 3; c++)
+                    assert_true(fabs((double)L[c] - s.truth[c]) <= max_bound * fmax(s.arriving[c], s.truth[c]));
+                free_scene(&s);
+            }
+        }
+}
+
+static void only_lights_that_arrive_are_kept(void **state)
+{
+    (void)state;
+    for (int k = 0; k < N_NAMES; k++) {
+        const struct kernels *kernels = kernels_by_name(names[k]);
+        for (uint64_t id = 0; kernels && id < 120; id++) {
+            struct scene s;
+            make_scene(&s, HIDDEN, 80000 + id);
+            kernels->gather(&s.lit, &s.lights, &s.surface, s.visible, NULL);
+            int expected = 0;
+            for (int i = 0; i < s.n; i++) {
+                const struct light_arrays *a = &s.lights;
+                const double d[3] = { (double)a->dx[i], (double)a->dy[i], (double)a->dz[i] };
+                double u[3], n[3];
+                for (int c = 0; c < 3; c++) {
+                    u[c] = d[c] + (double)a->q[i] * ((double)a->centre_m[c] - (double)s.surface.position_m[c]);
+                    n[c] = (double)s.surface.normal[c];
+                }
+                expected += vec3_dot(u, n) > 0 && vec3_dot(u, d) > 0 && (s.visible[i / 16] >> i % 16 & 1);
+            }
+            assert_int_equal(s.lit.n, expected);
+            for (int i = 0; i < s.lit.n; i++)
+                assert_true(s.lit.nl[i] > 0 && s.lit.wr[i] >= 0);
+            for (int i = s.lit.n; i % KERNEL_WIDTH; i++)
+                assert_true(s.lit.wr[i] == 0 && s.lit.wg[i] == 0 && s.lit.wb[i] == 0);
+            free_scene(&s);
+        }
+    }
+}
+
+static void a_view_from_below_sees_nothing(void **state)
+{
+    (void)state;
+    for (int k = 0; k < N_NAMES; k++) {
+        const struct kernels *kernels = kernels_by_name(names[k]);
+        if (!kernels)
+            continue;
+        struct scene s;
+        struct shade_jacobian j, zero = { 0 };
+        float L[3] = { 1, 1, 1 };
+        make_scene(&s, PLAIN, 90010);
+        for (int c = 0; c < 3; c++)
+            s.v[c] = -s.v[c];
+        kernels->gather(&s.lit, &s.lights, &s.surface, NULL, NULL);
+        kernels->shade(L, &s.lit, &s.surface, s.v, &s.material);
+        assert_true(L[0] == 0 && L[1] == 0 && L[2] == 0);
+        memset(&j, 0xff, sizeof(j));
+        kernels->shade_jacobian(&j, &s.lit, &s.surface, s.v, &s.material);
+        assert_memory_equal(&j, &zero, sizeof(j));
+        memset(&j, 0xff, sizeof(j));
+        kernels->brute_jacobian(&j, &s.lights, &s.surface, s.v, &s.material);
+        assert_memory_equal(&j, &zero, sizeof(j));
+        free_scene(&s);
+    }
+}
+
+static void updated_lights_are_those_made_anew(void **state)
+{
+    (void)state;
+    double direction[2][3] = { { 0, 0, 1 }, { .6, 0, .8 } }, irradiance[2][3] = { { 1, 2, 3 }, { 4, 5, 6 } };
+    double inverse_distance[2] = { 0, .5 };
+    struct lights lights = { .n = 2, .dir_probe = direction, .irradiance = irradiance, .inverse_distance = inverse_distance,
+                             .world_from_probe = { 1, 0, 0, 0, 1, 0, 0, 0, 1 } };
+    struct light_arrays a, b;
+    assert_int_equal(light_arrays_new(&a, &lights), 0);
+    const double quarter_turn[9] = { 0, -1, 0, 1, 0, 0, 0, 0, 1 };
+    memcpy(lights.world_from_probe, quarter_turn, sizeof(quarter_turn));
+    lights.centre_m[1] = 2, inverse_distance[0] = .25;
+    light_arrays_update(&a, &lights);
+    assert_int_equal(light_arrays_new(&b, &lights), 0);
+    assert_true(a.dy[1] == .6f && a.dz[1] == .8f && a.q[0] == .25f && a.centre_m[1] == 2 && a.cb[1] == 6);
+    assert_int_equal(a.n_padded, KERNEL_WIDTH);
+    assert_memory_equal(a.dx, b.dx, 7 * KERNEL_WIDTH * sizeof(float));
+    light_arrays_free(&a);
+    light_arrays_free(&b);
+}
+
+static void count_warnings(void *arg, enum log_level level, const char *message)
+{
+    *(int *)arg += level == LOG_WARNING && strstr(message, "RIGSOLVE_KERNEL") != NULL;
+}
+
+static void the_environment_chooses_the_kernel(void **state)
+{
+    (void)state;
+    static const unsigned bits[] = { KERNELS_REFERENCE, KERNELS_PORTABLE, KERNELS_AVX2, KERNELS_AVX512 };
+    int n_warnings = 0, best = 0;
+    unsetenv("RIGSOLVE_KERNEL");
+    for (int k = 0; k < N_NAMES; k++) {
+        if (!kernels_by_name(names[k])) {
+            assert_string_equal(kernels_select(bits[k])->name, "reference");
+            continue;
+        }
+        best = k;
+        assert_string_equal(kernels_select(bits[k])->name, names[k]);
+        setenv("RIGSOLVE_KERNEL", names[k], 1);
+        assert_string_equal(kernels_select(KERNELS_ALL)->name, names[k]);
+        unsetenv("RIGSOLVE_KERNEL");
+    }
+    assert_string_equal(kernels_select(KERNELS_ALL)->name, names[best]);
+    assert_null(kernels_by_name("sse"));
+    log_set_hook(count_warnings, &n_warnings);
+    setenv("RIGSOLVE_KERNEL", "abacus", 1);
+    assert_string_equal(kernels_select(KERNELS_ALL)->name, names[best]);
+    assert_int_equal(n_warnings, 1);
+    unsetenv("RIGSOLVE_KERNEL");
+    log_set_hook(NULL, NULL);
+}
+
+static double cpu_s(void)
+{
+    struct timespec t;
+    clock_gettime(CLOCK_PROCESS_CPUTIME_ID, &t);
+    return (double)t.tv_sec + 1e-9 * (double)t.tv_nsec;
+}
+
+// Not a test of speed: the figures stand beside the errors. `make bench` measures properly.
+static void times_are_printed(void **state)
+{
+    (void)state;
+    struct scene s;
+    make_scene(&s, NEAR_FIELD, 10);
+    assert_int_equal(s.n, 256);
+    for (int k = 0; k < N_NAMES; k++) {
+        const struct kernels *kernels = kernels_by_name(names[k]);
+        if (!kernels)
+            continue;
+        for (int f = 0; f < N_FUNCTIONS; f++) {
+            const double begin = cpu_s();
+            double spent = 0;
+            long n = 0;
+            struct shade_jacobian j;
+            float L[3];
+            kernels->gather(&s.lit, &s.lights, &s.surface, NULL, NULL);
+            for (; spent < .01; n += s.n, spent = cpu_s() - begin)
+                if (f == SHADE)
+                    kernels->shade(L, &s.lit, &s.surface, s.v, &s.material);
+                else if (f == SHADE_JACOBIAN)
+                    kernels->shade_jacobian(&j, &s.lit, &s.surface, s.v, &s.material);
+                else if (f == BRUTE_JACOBIAN)
+                    kernels->brute_jacobian(&j, &s.lights, &s.surface, s.v, &s.material);
+                else if (f == VIEWS)
+                    kernels->shade_jacobian_views(&j, 1, &s.lit, &s.surface, &s.v, &s.material);
+                else
+                    kernels->irradiance(L, &s.lights, &s.surface, NULL);
+            printf("# %-9s %-14s %.2f ns per sample and light\n", names[k], function_names[f], 1e9 * spent / (double)n);
+            assert_true(n > 0);
+        }
+    }
+    free_scene(&s);
+}
+
+int main(void)
+{
+    const struct CMUnitTest tests[] = {
+        cmocka_unit_test(every_kernel_is_right_on_hard_inputs),
+        cmocka_unit_test(ordinary_samples_are_right_to_the_arriving_light),
+        cmocka_unit_test(what_one_kernel_gathers_another_may_shade),
+        cmocka_unit_test(only_lights_that_arrive_are_kept),
+        cmocka_unit_test(a_view_from_below_sees_nothing),
+        cmocka_unit_test(updated_lights_are_those_made_anew),
+        cmocka_unit_test(the_environment_chooses_the_kernel),
+        cmocka_unit_test(times_are_printed),
+    };
+    return cmocka_run_group_tests(tests, NULL, NULL);
+}
