@@ -33,6 +33,7 @@ struct lit {
     float *lx, *ly, *nl, *sl /* S(nl) = (1-nl)^5 */, *gc /* clearcoat's g1(nl, .25) */, *wr, *wg, *wb;
     float *lx_rest, *ly_rest; // what float left of lx, ly: sharp lobes need it
     float *g, *g_r, *g_a;     // scratch of shade_jacobian_views
+    int32_t *index;           // which light
 };
 int lit_new(struct lit *out, int n_lights); // 0 or -ENOMEM
 void lit_free(struct lit *l);
@@ -45,6 +46,14 @@ struct shade_jacobian {      // of outgoing radiance L (3 channels)
     float L[3];
     float theta[3][DISNEY_N];
     float albedo[3][3];      // [channel of L][channel of albedo]
+    float own[3];            // dL / d albedo of the same channel at fixed tint: L is affine in it (SOLVER.md 4)
+};
+
+// How L changes when the set-up moves: l_i and c_i(p) by Eqs. 1-4, f and the cosine by l.
+struct shade_setup {
+    float *inverse_distance[3]; // [channel][lights->n_padded], the caller's arrays: dL / d(1/r_i); 0 where light i adds nothing
+    float centre[3][3];         // [channel][x, y, z]: dL / dc
+    float rotation[3][3];       // [channel][w]: dL / dw, R = exp([w]x) R0, at w = 0
 };
 
 struct kernels {
@@ -67,6 +76,16 @@ struct kernels {
     // shade_jacobian for all views of a texel, sharing what depends on light and material. Writes the scratch arrays of lit.
     void (*shade_jacobian_views)(struct shade_jacobian *out, int n_views, struct lit *lit, const struct surface_point *s,
                                  const float (*v)[3], const struct shade_material *m);
+    // L = constant + own * albedo per channel, the tint T being held at m's albedo: what variable projection eliminates.
+    void (*shade_affine)(float constant[3], float own[3], const struct lit *lit, const struct surface_point *s,
+                         const float v[3], const struct shade_material *m);
+    // shade_jacobian and the derivatives by the set-up. lit was gathered from these lights at s.
+    void (*shade_setup)(struct shade_jacobian *out, struct shade_setup *setup, const struct lit *lit,
+                        const struct light_arrays *lights, const struct surface_point *s, const float v[3],
+                        const struct shade_material *m);
+    // The same for Lambert: E as irradiance() gives it, and its derivatives.
+    void (*irradiance_setup)(float E[3], struct shade_setup *setup, const struct light_arrays *lights,
+                             const struct surface_point *s, const uint16_t *visible);
 };
 
 enum { KERNELS_REFERENCE = 1, KERNELS_PORTABLE = 2, KERNELS_AVX2 = 4, KERNELS_AVX512 = 8, KERNELS_ALL = 15 };

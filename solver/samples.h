@@ -1,0 +1,48 @@
+// solver/samples.h - what the cameras measured of every texel.
+//
+// One sample: texel t seen by view k, linear radiance at the projected texel centre. Samples are stored texel by texel, views
+// ascending; radiance as half floats. A view is decoded once, at most two are in memory at a time.
+#pragma once
+#include "solver/cameras.h"
+#include "solver/rays.h"
+#include "solver/texels.h"
+#include <stdint.h>
+
+enum sample_flags {
+    SAMPLE_CLIPPED = 1, // a pixel under it was at or above white: the radiance is a lower bound
+};
+
+struct samples {
+    int n_texels, n_views;
+    int64_t n;
+    int64_t *first;          // [n_texels + 1]: texel t has samples first[t] .. first[t+1]-1
+    uint16_t *view;          // [n]
+    uint16_t (*radiance)[3]; // [n] half floats, R G B; samples_radiance() widens
+    uint16_t *gradient;      // [n] half float: |d luminance / d pixel| at the sample, per pixel (for registration error)
+    uint8_t *flags;          // [n]
+    double (*centre_m)[3];   // [n_views] camera centres
+    char (*name)[CAMERA_NAME_MAX]; // [n_views]
+    double clipped_share;    // of all samples
+};
+
+struct samples_settings {
+    double grazing_cos; // samples below are left out; .15 (SOLVER.md 2)
+    int erode_px;       // samples this near (in pixels) to a silhouette or depth edge are left out; 1
+    double white;       // clip level where an image has no "clip" channel; 1.0; 0: never
+    int n_threads;
+};
+struct samples_settings samples_defaults(void);
+
+// Project every texel into every view (image_paths[k] belongs to cameras->view[k]; NULL: the view is skipped), test visibility with
+// rays, and read the radiance: bilinear at the texel centre where the texel's footprint is at most a pixel, else the mean over
+// the footprint (a box of the projected texel's size, at most 8 x 8 px). Images of another size than the camera says are
+// accepted when the aspect matches (the camera is resized), else refused. Pixels that are not finite refuse the view by name.
+// 0, -errno of reading (logged with the view), -EINVAL, -ENOMEM. Same bytes for any thread count.
+int samples_gather(struct samples *out, const struct texels *t, const struct rays *r, const struct cameras *cameras,
+                   const char *const *image_paths, const struct samples_settings *settings);
+void samples_free(struct samples *s); // leaves it zeroed
+
+void samples_radiance(const struct samples *s, int64_t i, float rgb[3]);
+float samples_gradient(const struct samples *s, int64_t i);
+// Unit direction from the texel to view k's centre.
+void samples_view_direction(const struct samples *s, const struct texels *t, int texel, int view, float v[3]);
