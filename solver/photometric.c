@@ -121,7 +121,6 @@ struct worker {
     struct lit lit;
     struct normal_rows rows;
     float *by_light[3];           // [n_padded]
-    float (*by_group)[3];         // scratch of one row per channel: not used by Lambert
     float *block;                 // [MAX_VIEWS][3][n]: the texel's rows before the projection
     struct observation *seen;     // [MAX_VIEWS]
 };
@@ -142,7 +141,7 @@ struct job {
     struct worker *workers;
     int n_workers;
     bool fit;
-    const unsigned char *is_free;
+    int n_free, *column;          // the compact place of each unknown, -1: not free
     bool tinted;                  // the tint matters: solve the albedo twice
     float *residual;              // [samples n] for the scale and the robust weights, or NULL
 };
@@ -159,10 +158,12 @@ static void job_free(struct job *j)
         free(w->seen);
     }
     free(j->workers);
+    free(j->column);
     light_arrays_free(&j->lights);
 }
 
-static int job_new(struct job *j, const struct photometric *p, struct photometric_state *s, bool with_rows)
+// is_free NULL: no rows are made.
+static int job_new(struct job *j, const struct photometric *p, struct photometric_state *s, const unsigned char *is_free)
 {
     memset(j, 0, sizeof(*j));
     j->p = p, j->s = s;
@@ -174,18 +175,23 @@ static int job_new(struct job *j, const struct photometric *p, struct photometri
     if (light_arrays_new(&j->lights, &s->lights))
         return -ENOMEM;
     j->workers = calloc((size_t)j->n_workers, sizeof(*j->workers));
+    j->column = malloc((size_t)j->layout.n * sizeof(int));
+    for (int i = 0; j->column && is_free && i < j->layout.n; i++)
+        j->column[i] = is_free[i] ? j->n_free++ : -1;
+    if (!j->column)
+        goto fail;
     for (int i = 0; j->workers && i < j->n_workers; i++) {
         struct worker *w = &j->workers[i];
         w->seen = malloc(MAX_VIEWS_PER_TEXEL * sizeof(*w->seen));
         if (!w->seen || lit_new(&w->lit, s->lights.n))
             goto fail;
-        if (!with_rows)
+        if (!is_free)
             continue;
         for (int c = 0; c < 3; c++)
             if (!(w->by_light[c] = aligned_alloc(64, (size_t)j->lights.n_padded * sizeof(float))))
                 goto fail;
-        w->block = malloc((size_t)j->layout.n * 3 * MAX_VIEWS_PER_TEXEL * sizeof(float));
-        if (!w->block || normal_rows_new(&w->rows, j->layout.n))
+        w->block = malloc(((size_t)j->n_free + 1) * 3 * MAX_VIEWS_PER_TEXEL * sizeof(float));
+        if (!w->block || normal_rows_new(&w->rows, j->n_free))
             goto fail;
     }
     if (j->workers)
@@ -294,6 +300,8 @@ static void evaluate_texels(void *arg, int64_t begin, int64_t end, int worker, d
     struct job *j = arg;
     struct worker *w = &j->workers[worker];
     for (int texel = (int)begin; texel < (int)end; texel++) {
+        if (texel % j->p->texel_step)
+            continue;
         struct surface_point point;
         struct shade_material m;
         const int n_seen = observe(j, texel, w->seen);
@@ -343,7 +351,7 @@ static int evaluate(const struct photometric *p, struct photometric_state *s, bo
 {
     struct job j;
     double sums[3] = { 0 };
-    int err = job_new(&j, p, s, false);
+    int err = job_new(&j, p, s, NULL);
     if (err)
         return err;
     j.fit = fit;
@@ -362,26 +370,28 @@ int photometric_evaluate(const struct photometric *p, struct photometric_state *
 
 // ---- normal equations ---------------------------------------------------------------------------------------------------
 
-// One row per channel of an observation, in the order of the layout; not weighted. row[c] has layout.n floats.
-static void fill_row(const struct job *j, float *row, int c, const struct observation *o, const struct shade_jacobian *d,
+static void put(const struct job *j, float *row, int unknown, float value)
+{
+    if (j->column[unknown] >= 0)
+        row[j->column[unknown]] += value;
+}
+
+// The row of channel c of an observation over the free unknowns, times `scale`.
+static void fill_row(const struct job *j, float *row, int c, int view, float scale, const struct shade_jacobian *d,
                      const struct shade_setup *setup)
 {
     const struct photometric_layout *l = &j->layout;
-    const float gain = o->gain;
-    memset(row, 0, (size_t)l->n * sizeof(float));
+    memset(row, 0, (size_t)j->n_free * sizeof(float));
     for (int i = 0; i < DISNEY_N; i++)
-        row[l->theta + i] = gain * d->theta[c][i];
+        put(j, row, l->theta + i, scale * d->theta[c][i]);
     for (int i = 0; i < 3; i++) {
-        row[l->centre + i] = gain * setup->centre[c][i];
-        row[l->rotation + i] = gain * setup->rotation[c][i];
-        row[l->albedo + i] = gain * d->albedo[c][i];
+        put(j, row, l->centre + i, scale * setup->centre[c][i]);
+        put(j, row, l->rotation + i, scale * setup->rotation[c][i]);
+        put(j, row, l->albedo + i, scale * d->albedo[c][i]);
     }
-    row[l->gain + o->view] = gain * d->L[c];
+    put(j, row, l->gain + view, scale * d->L[c]);
     for (int i = 0; i < j->lights.n; i++)
-        row[l->inverse_distance + j->p->group_of_light[i]] += gain * setup->inverse_distance[c][i];
-    for (int i = 0; i < l->n; i++)
-        if (!j->is_free[i])
-            row[i] = 0;
+        put(j, row, l->inverse_distance + j->p->group_of_light[i], scale * setup->inverse_distance[c][i]);
 }
 
 // Remove from the texel's rows of one channel what a change of its albedo would explain.
@@ -413,11 +423,13 @@ static void add_texels(void *arg, int64_t begin, int64_t end, int worker, double
 {
     struct job *j = arg;
     struct worker *w = &j->workers[worker];
-    const int n = j->layout.n;
+    const int n = j->n_free;
     const size_t stride = (size_t)n * 3;
-    float explained[n];
+    float explained[n + 1];
     w->rows.A = partial, w->rows.g = partial + (size_t)n * (size_t)n;
     for (int texel = (int)begin; texel < (int)end; texel++) {
+        if (texel % j->p->texel_step)
+            continue;
         struct surface_point point;
         struct shade_material m;
         struct shade_jacobian d = { 0 };
@@ -454,13 +466,11 @@ static void add_texels(void *arg, int64_t begin, int64_t end, int worker, double
             for (int c = 0; c < 3; c++) {
                 o->own[c] = o->gain * d.own[c];
                 o->constant[c] = o->gain * d.L[c] - o->own[c] * m.albedo[c];
-                float *row = w->block + (size_t)k * stride + (size_t)c * (size_t)n;
-                fill_row(j, row, c, o, &d, &setup);
-                const float root = sqrtf(o->weight) * (float)!(o->clipped && residual_of(o, c, m.albedo[c]) == 0);
-                if (root == 0)
+                const bool silent = o->clipped && residual_of(o, c, m.albedo[c]) == 0;
+                fill_row(j, w->block + (size_t)k * stride + (size_t)c * (size_t)n, c, o->view,
+                         silent ? 0 : sqrtf(o->weight) * o->gain, &d, &setup);
+                if (silent)
                     o->own[c] = 0;
-                for (int i = 0; i < n; i++)
-                    row[i] *= root;
             }
         }
         for (int c = 0; c < 3; c++) {
@@ -481,21 +491,24 @@ int photometric_normal_equations(const struct photometric *p, const struct photo
                                  const unsigned char *is_free, double *A, double *g)
 {
     struct job j;
-    const int n = layout_of(p).n;
-    const size_t n_sums = (size_t)n * (size_t)n + (size_t)n;
-    double *sums = calloc(n_sums, sizeof(double));
-    int err = sums ? job_new(&j, p, (struct photometric_state *)s, true) : -ENOMEM;
-    if (!err) {
-        j.is_free = is_free;
-        err = parallel_sum(j.n_workers, p->texels->n, chunk_of(p), add_texels, &j, (int)n_sums, sums);
-        job_free(&j);
-    }
-    for (int i = 0; !err && i < n; i++) {
-        for (int k = 0; k <= i; k++)
-            A[(size_t)i * (size_t)n + (size_t)k] += sums[(size_t)i * (size_t)n + (size_t)k];
-        g[i] += sums[(size_t)n * (size_t)n + (size_t)i];
+    double *sums = NULL;
+    int err = job_new(&j, p, (struct photometric_state *)s, is_free);
+    if (err)
+        return err;
+    const size_t n = (size_t)j.layout.n, m = (size_t)j.n_free, n_sums = m * m + m;
+    sums = calloc(n_sums + 1, sizeof(double));
+    err = !sums ? -ENOMEM : parallel_sum(j.n_workers, p->texels->n, chunk_of(p), add_texels, &j, (int)n_sums, sums);
+    for (size_t i = 0; !err && i < n; i++) {
+        if (j.column[i] < 0)
+            continue;
+        const size_t row = (size_t)j.column[i];
+        for (size_t k = 0; k <= i; k++)
+            if (j.column[k] >= 0)
+                A[i * n + k] += sums[row * m + (size_t)j.column[k]];
+        g[i] += sums[m * m + row];
     }
     free(sums);
+    job_free(&j);
     return err;
 }
 

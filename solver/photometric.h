@@ -32,6 +32,7 @@ struct photometric {
     const int32_t *group_of_light;  // [lights n]
     int n_groups;
     const uint8_t *use_view;        // [n_views] 0: left out; NULL: all
+    int texel_step;                 // only every so many texels (1: all): a coarse look costs less
     const float *weight;            // [samples n], or NULL: 1
     const uint16_t *visible;        // [n_texels][words], or NULL: everything
     int words_per_texel;
