@@ -146,8 +146,8 @@ static void step(double q[4], const double (*a)[3], const double (*b)[3], const 
         vec3_add_scaled(g, g, w, turn);
         for (int j = 0; j < 3; j++)
             for (int k = 0; k < 3; k++)
-                H[j][k] += w * ((j == k ? vec3_dot(p, b[i]) : 0) -
-                                (p[j] * b[i][k] + b[i][j] * p[k]) / 2);
+                H[j][k] +=
+                    w * ((j == k ? vec3_dot(p, b[i]) : 0) - (p[j] * b[i][k] + b[i][j] * p[k]) / 2);
     }
     eigen(3, H, value, vector);
     double turn[3] = {0};
