@@ -522,7 +522,7 @@ static struct lights random_set_up(int n, int kind, int trial)
                 l.dir_probe[i][k] = (i % 2 ? -1 : 1) * l.dir_probe[0][k];
         }
         if (kind == 0 || kind == ON_A_LINE || (kind == 1 && i % 3 == 0))
-            l.inverse_distance[i] = 1 / (.5 + 5 * random_uniform(SEED, 15, at));
+            l.inverse_distance[i] = .1 + 2 * random_uniform(SEED, 15, at);
         l.group[i] = (int32_t)(random_u64(SEED, 16, at) % (uint64_t)(n + 1)) - 1;
     }
     return l;
