@@ -38,7 +38,7 @@ SOLVER := $(addprefix solver/,cameras.c cameras_colmap.c compare.c csv.c disney.
 KERNELS := $(addprefix solver/kernels/,kernels.c kernels_ref.c kernels_portable.c kernels_avx2.c kernels_avx512.c)
 COMMANDS := $(addprefix solver/commands/,brdf.c compare.c lights.c render.c synth.c visibility.c)
 LIBRARY := $(TAKE) $(SOLVER) $(KERNELS)
-TESTS := $(addprefix test_,cameras compare disney image json lights mesh panorama parallel rays render shapes synth take texels vec3 visibility) check_kernels
+TESTS := $(addprefix test_,brdf cameras compare csv disney image json lights mesh panorama parallel rays render shapes synth take texels vec3 visibility) check_kernels
 FUZZERS := cameras csv exr hdr json lights mesh
 
 # ---- rules --------------------------------------------------------------------------------------------------------------
@@ -95,12 +95,9 @@ deps-bench: deps ; $(call install_packages,$(PACKAGES_BENCH))
 # ---- tests ----------------------------------------------------------------------------------------------------------------
 TEST_PROGRAMS := $(patsubst tests/%.c,$(BUILD)/tests/%,$(call have,$(addprefix tests/,$(addsuffix .c,$(TESTS)))))
 test: deps $(BUILD)/bin/rigsolve $(TEST_PROGRAMS)
-	@CMOCKA_MESSAGE_OUTPUT=TAP BIN=$(BUILD)/bin $(TEST_ENV) prove --timer --merge --exec '' tests/check_includes.sh $(TEST_PROGRAMS) tests/test_commands.sh
+	@CMOCKA_MESSAGE_OUTPUT=TAP BIN=$(BUILD)/bin prove --timer --merge --exec '' tests/check_includes.sh $(TEST_PROGRAMS) tests/test_commands.sh
 check-includes:
 	@prove --exec '' tests/check_includes.sh
-TEST_ENV_asan := ASAN_OPTIONS=detect_leaks=1:allocator_may_return_null=1 LSAN_OPTIONS=suppressions=tests/lsan.supp:print_suppressions=0
-TEST_ENV_tsan := TSAN_OPTIONS=suppressions=tests/tsan.supp:halt_on_error=1
-TEST_ENV = $(TEST_ENV_$(VARIANT))
 
 FUZZ_SECONDS ?= 60
 FUZZ_FLAGS = -std=gnu11 -D_GNU_SOURCE -O1 -g -fsanitize=fuzzer,address,undefined -fno-sanitize-recover=undefined -pthread -I. \
@@ -114,10 +111,13 @@ fuzz: deps deps-fuzz $(FUZZ_PROGRAMS)
 demo: deps $(BUILD)/bin/rigsolve
 	@BIN=$(BUILD)/bin sh tests/demo.sh build/demo
 
-BENCH_PROGRAMS := $(patsubst tests/bench/%.c,$(BUILD)/tests/bench/%,$(call have,$(wildcard tests/bench/*.c)))
-$(BUILD)/tests/bench/bench_kernels: $(if $(wildcard /usr/include/ceres/jet.h),$(BUILD)/obj/tests/bench/ceres_peer.o)
+HAVE_CERES := $(wildcard /usr/include/ceres/jet.h)
+BENCHES := kernels rays synth
+BENCH_PROGRAMS := $(addprefix $(BUILD)/tests/bench/bench_,$(BENCHES))
+$(BUILD)/tests/bench/bench_kernels: LIBS += $(if $(HAVE_CERES),-lstdc++)
+$(BUILD)/tests/bench/bench_kernels: $(if $(HAVE_CERES),$(BUILD)/obj/tests/bench/ceres_peer.o)
 bench: deps $(BENCH_PROGRAMS) $(BUILD)/bin/rigsolve
-	@for b in kernels rays synth; do echo "== bench_$$b"; $(BUILD)/tests/bench/bench_$$b || exit 1; done
+	@for b in $(BENCHES); do echo "== bench_$$b"; $(BUILD)/tests/bench/bench_$$b || exit 1; done
 chart: deps deps-bench $(BUILD)/tests/bench/chart_lights
 	@mkdir -p build/chart && $(BUILD)/tests/bench/chart_lights >build/chart/lights.csv && gnuplot -e "out='build/chart/lights'" tests/bench/chart_lights.gp
 	@echo "chart: build/chart/lights.csv .svg .png: seconds against error over N, roughness and kernel"

@@ -1,7 +1,9 @@
-// solver/rays.c - a mesh that answers rays, by Embree 3 or 4 (which of them is decided by the headers that are installed).
+// solver/rays.c - a mesh that answers rays, by Embree 3 or 4 (which of them is decided by the
+// headers that are installed).
 //
-// One device per mesh, with one build thread and no affinity: the tree, and so the triangle that wins a tie on a shared edge,
-// does not depend on how many cores there are. The robust flag makes shared edges watertight: no light leaks between triangles.
+// One device per mesh, with one build thread and no affinity: the tree, and so the triangle that
+// wins a tie on a shared edge, does not depend on how many cores there are. The robust flag makes
+// shared edges watertight: no light leaks between triangles.
 #include "solver/rays.h"
 #include "solver/take/log.h"
 #include "solver/vec3.h"
@@ -39,18 +41,17 @@ static int errno_of(enum RTCError code)
     return code == RTC_ERROR_OUT_OF_MEMORY ? -ENOMEM : -EIO;
 }
 
-// Embree's own copy: its buffers must be readable 16 bytes beyond the last vertex, which the mesh does not promise.
+// Embree's own copy: its buffers must be readable 16 bytes beyond the last vertex, which the mesh
+// does not promise.
 static int attach(struct rays *r, const struct mesh *mesh)
 {
     RTCGeometry geometry = rtcNewGeometry(r->device, RTC_GEOMETRY_TYPE_TRIANGLE);
     if (!geometry)
         return errno_of(rtcGetDeviceError(r->device));
-    void *vertices =
-        rtcSetNewGeometryBuffer(geometry, RTC_BUFFER_TYPE_VERTEX, 0, RTC_FORMAT_FLOAT3,
-                                sizeof(mesh->position_m[0]), (size_t)mesh->n_vertices);
-    void *triangles =
-        rtcSetNewGeometryBuffer(geometry, RTC_BUFFER_TYPE_INDEX, 0, RTC_FORMAT_UINT3,
-                                sizeof(mesh->triangle[0]), (size_t)mesh->n_triangles);
+    void *vertices = rtcSetNewGeometryBuffer(geometry, RTC_BUFFER_TYPE_VERTEX, 0, RTC_FORMAT_FLOAT3,
+                                             sizeof(mesh->position_m[0]), (size_t)mesh->n_vertices);
+    void *triangles = rtcSetNewGeometryBuffer(geometry, RTC_BUFFER_TYPE_INDEX, 0, RTC_FORMAT_UINT3,
+                                              sizeof(mesh->triangle[0]), (size_t)mesh->n_triangles);
     if (vertices && triangles) {
         memcpy(vertices, mesh->position_m, (size_t)mesh->n_vertices * sizeof(mesh->position_m[0]));
         memcpy(triangles, mesh->triangle, (size_t)mesh->n_triangles * sizeof(mesh->triangle[0]));
@@ -146,7 +147,8 @@ void rays_free(struct rays *r)
 // Embree's own limit of coordinates; Debian's build asserts it.
 static const float MOST_COORDINATE = 1.8e18f;
 
-// False for a ray that asks nothing: no direction, an empty interval, a NaN anywhere, or out of all bounds.
+// False for a ray that asks nothing: no direction, an empty interval, a NaN anywhere, or out of all
+// bounds.
 static bool make_ray(struct RTCRay *ray, const float origin_m[3], const float dir[3], float t_min,
                      float t_max)
 {
@@ -156,9 +158,15 @@ static bool make_ray(struct RTCRay *ray, const float origin_m[3], const float di
     if ((dir[0] == 0 && dir[1] == 0 && dir[2] == 0) || !(t_min < t_max))
         return false;
     *ray = (struct RTCRay){
-        .org_x = origin_m[0], .org_y = origin_m[1], .org_z = origin_m[2],
-        .dir_x = dir[0], .dir_y = dir[1], .dir_z = dir[2],
-        .tnear = t_min > 0 ? t_min : 0, .tfar = t_max, .mask = (unsigned)-1,
+        .org_x = origin_m[0],
+        .org_y = origin_m[1],
+        .org_z = origin_m[2],
+        .dir_x = dir[0],
+        .dir_y = dir[1],
+        .dir_z = dir[2],
+        .tnear = t_min > 0 ? t_min : 0,
+        .tfar = t_max,
+        .mask = (unsigned)-1,
     };
     return ray->tnear < ray->tfar;
 }
@@ -179,8 +187,8 @@ bool rays_blocked(const struct rays *r, const float origin_m[3], const float dir
     return ray.tfar < 0; // Embree's sign for "hit": -infinity
 }
 
-bool rays_hit(const struct rays *r, const float origin_m[3], const float dir[3], float t_min, float t_max,
-              struct ray_hit *hit)
+bool rays_hit(const struct rays *r, const float origin_m[3], const float dir[3], float t_min,
+              float t_max, struct ray_hit *hit)
 {
     struct RTCRayHit query;
     if (!make_ray(&query.ray, origin_m, dir, t_min, t_max))
@@ -219,11 +227,12 @@ void rays_start(const struct rays *r, uint32_t triangle, const float barycentric
             normal[i] += weight[k] * r->normal[corner[k]][i];
         }
     vec3_normalise(normal);
-    // How far the point lies below each corner's tangent plane; planes below the point (a hollow) lift nothing.
+    // How far the point lies below each corner's tangent plane; planes below the point (a hollow)
+    // lift nothing.
     for (int k = 0; k < 3; k++) {
         const float *q = r->position_m[corner[k]], *n = r->normal[corner[k]];
-        const double below = (q[0] - point[0]) * n[0] + (q[1] - point[1]) * n[1] +
-                             (q[2] - point[2]) * n[2];
+        const double below =
+            (q[0] - point[0]) * n[0] + (q[1] - point[1]) * n[1] + (q[2] - point[2]) * n[2];
         for (int i = 0; below > 0 && i < 3; i++)
             lift[i] += weight[k] * below * n[i];
     }
@@ -232,15 +241,15 @@ void rays_start(const struct rays *r, uint32_t triangle, const float barycentric
         base[i] = (float)(point[i] + r->offset_m * normal[i]);
         towards[i] = (float)lift[i];
     }
-    // Another part of the surface within the lift: the facet itself is then the better start. (Not asked of lifts as small as
-    // the offset itself: on fine meshes that saves a ray per point.)
+    // Another part of the surface within the lift: the facet itself is then the better start. (Not
+    // asked of lifts as small as the offset itself: on fine meshes that saves a ray per point.)
     const bool lifted = vec3_norm(lift) <= r->offset_m || !rays_blocked(r, base, towards, 0, 1);
     for (int i = 0; i < 3; i++)
         start_m[i] = lifted ? base[i] + towards[i] : base[i];
 }
 
-bool rays_blocked_brute_force(const struct mesh *mesh, const double origin_m[3], const double dir[3],
-                              double t_min, double t_max)
+bool rays_blocked_brute_force(const struct mesh *mesh, const double origin_m[3],
+                              const double dir[3], double t_min, double t_max)
 {
     for (int i = 0; i < mesh->n_triangles; i++) {
         double corner[3][3], e1[3], e2[3], s[3], p[3], q[3];

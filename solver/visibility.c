@@ -1,6 +1,7 @@
 // solver/visibility.c - who sees which texel: cameras, and lights.
 //
-// Everything is asked texel by texel, each by one thread, so the answers do not depend on how many there are.
+// Everything is asked texel by texel, each by one thread, so the answers do not depend on how many
+// there are.
 #include "solver/visibility.h"
 #include "solver/parallel.h"
 #include "solver/random.h"
@@ -24,7 +25,7 @@ static void to_double(double out[3], const float in[3])
     out[0] = in[0], out[1] = in[1], out[2] = in[2];
 }
 
-// ---- cameras ----------------------------------------------------------------------------------------------------------
+// ---- cameras ----
 
 struct camera_job {
     uint8_t *mask;
@@ -41,7 +42,8 @@ static uint8_t mask_of_texel(const struct camera_job *job, int64_t i)
     double point[3], normal[3], view[3], uv_px[2];
     to_double(point, t->position_m[i]);
     to_double(normal, t->normal[i]);
-    if (!camera_project(camera, point, uv_px, NULL) || !(uv_px[0] >= 0 && uv_px[0] < camera->width_px) ||
+    if (!camera_project(camera, point, uv_px, NULL) ||
+        !(uv_px[0] >= 0 && uv_px[0] < camera->width_px) ||
         !(uv_px[1] >= 0 && uv_px[1] < camera->height_px))
         return MASK_OUTSIDE;
     vec3_sub(view, camera->centre_m, point);
@@ -85,18 +87,20 @@ int visibility_write_mask_png(const uint8_t *mask, const struct texels *t, const
     return err;
 }
 
-// ---- lights: where from -------------------------------------------------------------------------------------------------
+// ---- lights: where from ----
 
 static double luminance_of(const struct image *image, int x, int y)
 {
-    const float *p = image->data + ((size_t)y * (size_t)image->width + (size_t)x) * (size_t)image->n_channels;
+    const float *p =
+        image->data + ((size_t)y * (size_t)image->width + (size_t)x) * (size_t)image->n_channels;
     return .2126 * p[0] + .7152 * p[1] + .0722 * p[2];
 }
 
-// The pixel in which the running sum passes target, and where in it (as a fraction): weight(arg, i) for i in [begin, end). Rounding
-// may leave target unpassed: then the end of the last pixel that has any weight.
-static double invert_sum(double target, int begin, int end, double (*weight)(const void *arg, int i),
-                         const void *arg)
+// The pixel in which the running sum passes target, and where in it (as a fraction): weight(arg, i)
+// for i in [begin, end). Rounding may leave target unpassed: then the end of the last pixel that
+// has any weight.
+static double invert_sum(double target, int begin, int end,
+                         double (*weight)(const void *arg, int i), const void *arg)
 {
     double position = begin;
     for (int i = begin; i < end; i++) {
@@ -133,11 +137,11 @@ static double energy_of_row(const void *arg, int y)
     return sum * panorama_solid_angle(row.image->width, row.image->height, y);
 }
 
-// n_sub probe directions within light i's region, with density proportional to its energy: rows by their share, columns within
-// the row by theirs (inverse of both cumulative sums), at the points of a rank-1 lattice shifted by the seed. A region
-// without energy is looked at along its middle.
-static void draw_sub_directions(double (*dir)[3], const struct lights *l, int i, const struct panorama *p,
-                                int n_sub, uint64_t seed)
+// n_sub probe directions within light i's region, with density proportional to its energy: rows by
+// their share, columns within the row by theirs (inverse of both cumulative sums), at the points of
+// a rank-1 lattice shifted by the seed. A region without energy is looked at along its middle.
+static void draw_sub_directions(double (*dir)[3], const struct lights *l, int i,
+                                const struct panorama *p, int n_sub, uint64_t seed)
 {
     struct region_row row = { &p->image, l->region[i], 0 };
     const struct light_region *g = &row.region;
@@ -179,15 +183,18 @@ static double angle_between(const double a[3], const double b[3])
     return atan2(vec3_norm(across), vec3_dot(a, b));
 }
 
-// The largest angle the light has moved by, seen from the middle and the corners of the texels' box.
-static double moved_rad(const struct light_visibility *v, int i, const double place[3], bool directional)
+// The largest angle the light has moved by, seen from the middle and the corners of the texels'
+// box.
+static double moved_rad(const struct light_visibility *v, int i, const double place[3],
+                        bool directional)
 {
     double largest = 0;
     for (int k = 0; k < 9; k++) {
         double before[3], after[3];
         for (int c = 0; c < 3; c++) {
-            const double from = v->reference_m[c] +
-                                (k == 8 ? 0 : (k >> c & 1) ? v->half_size_m[c] : -v->half_size_m[c]);
+            const double from = v->reference_m[c] + (k == 8         ? 0
+                                                     : (k >> c & 1) ? v->half_size_m[c]
+                                                                    : -v->half_size_m[c]);
             before[c] = v->traced_from_m[i][c] - (v->traced_directional[i] ? 0 : from);
             after[c] = place[c] - (directional ? 0 : from);
         }
@@ -196,7 +203,7 @@ static double moved_rad(const struct light_visibility *v, int i, const double pl
     return largest;
 }
 
-// ---- lights: tracing ----------------------------------------------------------------------------------------------------
+// ---- lights: tracing ----
 
 struct light_job {
     struct light_visibility *v;
@@ -210,8 +217,8 @@ struct light_job {
 };
 
 // u = R dh + q (c - x) points from x to the light, which is at x + u / q.
-static void towards_light(double u[3], const double rotated_dir[3], double q, const double centre_m[3],
-                          const double x[3])
+static void towards_light(double u[3], const double rotated_dir[3], double q,
+                          const double centre_m[3], const double x[3])
 {
     for (int c = 0; c < 3; c++)
         u[c] = rotated_dir[c] + q * (centre_m[c] - x[c]);
@@ -276,10 +283,16 @@ static int trace_listed(struct light_visibility *v, const struct rays *r, const 
             draw_sub_directions(of_light, l, listed[k], p, v->n_sub, seed);
         for (int s = 0; s < v->n_sub; s++)
             mat3_mul_vec(of_light[s], l->world_from_probe, of_light[s]);
-        v->traced_directional[listed[k]] = place_of_light(l, listed[k], v->traced_from_m[listed[k]]);
+        v->traced_directional[listed[k]] =
+            place_of_light(l, listed[k], v->traced_from_m[listed[k]]);
     }
-    struct light_job job = { .v = v, .rays = r, .texels = t, .lights = l, .n_listed = n_listed,
-                             .listed = listed, .dir = (const double(*)[3])dir };
+    struct light_job job = { .v = v,
+                             .rays = r,
+                             .texels = t,
+                             .lights = l,
+                             .n_listed = n_listed,
+                             .listed = listed,
+                             .dir = (const double(*)[3])dir };
     progress_begin("trace lights", t->n);
     parallel_for(n_threads, t->n, CHUNK, trace_texels, &job);
     progress_end();
@@ -292,11 +305,13 @@ static int trace_listed(struct light_visibility *v, const struct rays *r, const 
 static int check_regions(const struct lights *l, const struct panorama *p)
 {
     if (!l->region || !p) {
-        log_error("visibility: soft visibility needs lights cut from a panorama, and that panorama");
+        log_error(
+            "visibility: soft visibility needs lights cut from a panorama, and that panorama");
         return -EINVAL;
     }
     if (l->panorama_width_px != p->image.width || l->panorama_height_px != p->image.height) {
-        log_error("visibility: the lights were cut from a panorama of %d x %d, this one has %d x %d: cut them from this one",
+        log_error("visibility: the lights were cut from a panorama of %d x %d, this one has %d x "
+                  "%d: cut them from this one",
                   l->panorama_width_px, l->panorama_height_px, p->image.width, p->image.height);
         return -EINVAL;
     }
@@ -304,7 +319,8 @@ static int check_regions(const struct lights *l, const struct panorama *p)
         const struct light_region *g = &l->region[i];
         if (g->x0 < 0 || g->y0 < 0 || g->x0 > g->x1 || g->y0 > g->y1 || g->x1 > p->image.width ||
             g->y1 > p->image.height) {
-            log_error("visibility: light %d was cut from pixels [%d,%d) x [%d,%d), outside the panorama of "
+            log_error("visibility: light %d was cut from pixels [%d,%d) x [%d,%d), outside the "
+                      "panorama of "
                       "%d x %d: cut the lights from this panorama",
                       i, g->x0, g->x1, g->y0, g->y1, p->image.width, p->image.height);
             return -EINVAL;
@@ -326,9 +342,9 @@ static void set_reference(struct light_visibility *v, const struct texels *t)
     }
 }
 
-int light_visibility_trace(struct light_visibility *out, const struct rays *r, const struct texels *t,
-                           const struct lights *l, const struct panorama *p, int n_sub, uint64_t seed,
-                           int n_threads)
+int light_visibility_trace(struct light_visibility *out, const struct rays *r,
+                           const struct texels *t, const struct lights *l, const struct panorama *p,
+                           int n_sub, uint64_t seed, int n_threads)
 {
     memset(out, 0, sizeof(*out));
     if (n_sub != 1 && (n_sub < LEAST_SUB || n_sub > MOST_SUB)) {
@@ -339,8 +355,9 @@ int light_visibility_trace(struct light_visibility *out, const struct rays *r, c
     int err = n_sub > 1 ? check_regions(l, p) : 0;
     if (err)
         return err;
-    struct light_visibility v = { .n_texels = t->n, .n_lights = l->n,
-                                  .words_per_texel = (l->n + 15) / 16, .n_sub = n_sub };
+    struct light_visibility v = {
+        .n_texels = t->n, .n_lights = l->n, .words_per_texel = (l->n + 15) / 16, .n_sub = n_sub
+    };
     const size_t n_texels = (size_t)t->n, n_lights = (size_t)l->n;
     int *all = malloc((n_lights + 1) * sizeof(all[0]));
     v.bits = calloc(n_texels * (size_t)v.words_per_texel + 1, sizeof(v.bits[0]));
@@ -366,9 +383,10 @@ fail:
     return err;
 }
 
-int light_visibility_refresh(struct light_visibility *v, const struct rays *r, const struct texels *t,
-                             const struct lights *l, const struct panorama *p, double min_move_rad,
-                             uint64_t seed, int n_threads)
+int light_visibility_refresh(struct light_visibility *v, const struct rays *r,
+                             const struct texels *t, const struct lights *l,
+                             const struct panorama *p, double min_move_rad, uint64_t seed,
+                             int n_threads)
 {
     assert(v->n_lights == l->n && v->n_texels == t->n);
     int err = v->n_sub > 1 ? check_regions(l, p) : 0;
@@ -400,15 +418,21 @@ void light_visibility_free(struct light_visibility *v)
     memset(v, 0, sizeof(*v));
 }
 
-_Static_assert(__BYTE_ORDER__ == __ORDER_LITTLE_ENDIAN__, "the raw file is written as it lies in memory");
+_Static_assert(__BYTE_ORDER__ == __ORDER_LITTLE_ENDIAN__,
+               "the raw file is written as it lies in memory");
 
 int light_visibility_write(const struct light_visibility *v, int texture_size, const char *path)
 {
     const struct {
         char magic[8];
         uint32_t n_texels, n_lights, words_per_texel, n_sub, texture_size, zero;
-    } header = { "RIGVIS01", (uint32_t)v->n_texels, (uint32_t)v->n_lights,
-                 (uint32_t)v->words_per_texel, (uint32_t)v->n_sub, (uint32_t)texture_size, 0 };
+    } header = { "RIGVIS01",
+                 (uint32_t)v->n_texels,
+                 (uint32_t)v->n_lights,
+                 (uint32_t)v->words_per_texel,
+                 (uint32_t)v->n_sub,
+                 (uint32_t)texture_size,
+                 0 };
     _Static_assert(sizeof(header) == 32, "as the header promises");
     const size_t n_words = (size_t)v->n_texels * (size_t)v->words_per_texel;
     const size_t n_soft = v->soft ? (size_t)v->n_texels * (size_t)v->n_lights : 0;

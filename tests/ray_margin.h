@@ -1,10 +1,12 @@
-// tests/ray_margin.h - how far a ray is from changing its answer: by which "grazes an edge" is decided, in double.
+// tests/ray_margin.h - how far a ray is from changing its answer: by which "grazes an edge" is
+// decided, in double.
 #pragma once
 #include "solver/mesh.h"
 #include "solver/vec3.h"
 
-// Distance (metres) by which the ray segment passes inside triangle i (positive) or misses it (negative): the least of the
-// distances to its three edges, seen along the ray, and of the segment's two ends to its plane.
+// Distance (metres) by which the ray segment passes inside triangle i (positive) or misses it
+// (negative): the least of the distances to its three edges, seen along the ray, and of the
+// segment's two ends to its plane.
 static double ray_margin_of_triangle_m(const struct mesh *mesh, int i, const double origin_m[3],
                                        const double dir[3], double t_min, double t_max)
 {
@@ -34,9 +36,10 @@ static double ray_margin_of_triangle_m(const struct mesh *mesh, int i, const dou
     return margin;
 }
 
-// Positive: blocked, and still so if everything moves by less than that; negative: free by that much.
-static inline double ray_margin_m(const struct mesh *mesh, const double origin_m[3], const double dir[3],
-                                  double t_min, double t_max)
+// Positive: blocked, and still so if everything moves by less than that; negative: free by that
+// much.
+static inline double ray_margin_m(const struct mesh *mesh, const double origin_m[3],
+                                  const double dir[3], double t_min, double t_max)
 {
     double margin = -INFINITY;
     for (int i = 0; i < mesh->n_triangles; i++)

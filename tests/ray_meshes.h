@@ -1,4 +1,5 @@
-// tests/ray_meshes.h - meshes for the tests and the bench of rays and visibility: sphere, quads, disc, bumpy knob.
+// tests/ray_meshes.h - meshes for the tests and the bench of rays and visibility: sphere, quads,
+// disc, bumpy knob.
 #pragma once
 #include "solver/mesh.h"
 #include "solver/random.h"
@@ -12,7 +13,8 @@ struct ray_mesh_arrays {
     uint32_t (*triangle)[3];
 };
 
-static void ray_mesh_reserve(struct ray_mesh_arrays *a, int n_vertices, int n_triangles, bool normals)
+static void ray_mesh_reserve(struct ray_mesh_arrays *a, int n_vertices, int n_triangles,
+                             bool normals)
 {
     *a = (struct ray_mesh_arrays){
         .position = calloc((size_t)n_vertices, sizeof(a->position[0])),
@@ -25,13 +27,14 @@ static void ray_mesh_reserve(struct ray_mesh_arrays *a, int n_vertices, int n_tr
 static struct mesh ray_mesh_finish(struct ray_mesh_arrays *a)
 {
     struct mesh mesh;
-    if (mesh_from_arrays(&mesh, a->n_vertices, a->position, a->normal, a->uv, a->n_triangles, a->triangle))
+    if (mesh_from_arrays(&mesh, a->n_vertices, a->position, a->normal, a->uv, a->n_triangles,
+                         a->triangle))
         abort();
     return mesh;
 }
 
-// A grid of (columns + 1) x (rows + 1) vertices over the UV square [u0,u1] x [0,1]; place(u, v, position, normal) with u, v in
-// [0,1]; counter-clockwise seen from where u runs right and v up.
+// A grid of (columns + 1) x (rows + 1) vertices over the UV square [u0,u1] x [0,1]; place(u, v,
+// position, normal) with u, v in [0,1]; counter-clockwise seen from where u runs right and v up.
 typedef void ray_mesh_place(double u, double v, double position[3], double normal[3]);
 static void ray_mesh_grid(struct ray_mesh_arrays *a, int columns, int rows, double u0, double u1,
                           ray_mesh_place *place)
@@ -52,7 +55,8 @@ static void ray_mesh_grid(struct ray_mesh_arrays *a, int columns, int rows, doub
         }
     for (int j = 0; j < rows; j++)
         for (int i = 0; i < columns; i++) {
-            const uint32_t q = (uint32_t)(first + j * (columns + 1) + i), up = (uint32_t)columns + 1;
+            const uint32_t q = (uint32_t)(first + j * (columns + 1) + i),
+                           up = (uint32_t)columns + 1;
             const uint32_t two[2][3] = { { q, q + 1, q + up + 1 }, { q, q + up + 1, q + up } };
             for (int k = 0; k < 2; k++, a->n_triangles++)
                 for (int c = 0; c < 3; c++)
@@ -115,8 +119,8 @@ static void ray_mesh_place_floor(double u, double v, double p[3], double n[3])
     n[2] = 1;
 }
 
-// The floor [-1,1]^2 at z = 0 facing up, its UVs u < .9; above it at z = height a horizontal disc of n_rim corners about the
-// z axis, facing up, its UVs in a corner of the atlas.
+// The floor [-1,1]^2 at z = 0 facing up, its UVs u < .9; above it at z = height a horizontal disc
+// of n_rim corners about the z axis, facing up, its UVs in a corner of the atlas.
 static inline struct mesh ray_mesh_disc_above_floor(double height, double radius, int n_rim)
 {
     struct ray_mesh_arrays a;

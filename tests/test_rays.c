@@ -1,4 +1,5 @@
-// tests/test_rays.c - Embree's answers are those of a brute-force intersector, without leaks, and hostile rays do no harm.
+// tests/test_rays.c - Embree's answers are those of a brute-force intersector, without leaks, and
+// hostile rays do no harm.
 #include "solver/parallel.h"
 #include "solver/random.h"
 #include "solver/rays.h"
@@ -48,7 +49,8 @@ static void blocked_as_brute_force_says_except_within_a_millionth_of_an_edge(voi
         for (int i = 0; i < 3000; i++, n_all++) {
             float origin[3], dir[3];
             random_ray(&meshes[m], i, origin, dir);
-            const double o[3] = { origin[0], origin[1], origin[2] }, d[3] = { dir[0], dir[1], dir[2] };
+            const double o[3] = { origin[0], origin[1], origin[2] },
+                         d[3] = { dir[0], dir[1], dir[2] };
             const float t_max = i % 2 ? INFINITY : (float)vec3_norm(diagonal) / 3;
             const bool brute = rays_blocked_brute_force(&meshes[m], o, d, 0, t_max);
             const double margin_m = ray_margin_m(&meshes[m], o, d, 0, t_max);
@@ -128,7 +130,8 @@ static void interval_is_in_units_of_the_direction(void **state)
     (void)state;
     struct mesh mesh = ray_mesh_disc_above_floor(.5, .4, 12);
     struct rays *rays = rays_of(&mesh);
-    const float origin[3] = { .1f, .05f, 2 }, down[3] = { 0, 0, -.25f }; // disc at t = 6, floor at t = 8
+    const float origin[3] = { .1f, .05f, 2 },
+                down[3] = { 0, 0, -.25f }; // disc at t = 6, floor at t = 8
     assert_true(rays_blocked(rays, origin, down, 0, 6.01f));
     assert_false(rays_blocked(rays, origin, down, 0, 5.99f));
     assert_false(rays_blocked(rays, origin, down, 6.01f, 7.99f));
@@ -208,8 +211,8 @@ static void many_threads_may_ask_at_once(void **state)
     mesh_free(&mesh);
 }
 
-static void point_of(const struct mesh *mesh, int triangle, const float barycentric[2], double point[3],
-                     double normal[3])
+static void point_of(const struct mesh *mesh, int triangle, const float barycentric[2],
+                     double point[3], double normal[3])
 {
     const float w[3] = { 1 - barycentric[0] - barycentric[1], barycentric[0], barycentric[1] };
     for (int c = 0; c < 3; c++) {
@@ -249,7 +252,7 @@ static void coarse_sphere_does_not_shadow_itself_above_its_normals_horizon(void 
             flat[c] = (float)(point[c] + rays_offset_m(rays) * normal[c]);
         n_flat_would_fail += rays_blocked(rays, flat, d, 0, INFINITY);
     }
-    assert_in_range(n_flat_would_fail, 100, 20000); // or the sphere would not be coarse enough to try it
+    assert_in_range(n_flat_would_fail, 100, 20000); // or the sphere is not coarse enough to try it
     rays_free(rays);
     mesh_free(&mesh);
 }
@@ -267,9 +270,11 @@ static void rays_start_a_hair_above_a_flat_surface_and_never_inside_another(void
     assert_float_equal(start[2], rays_offset_m(rays), 1e-9);
     rays_free(rays);
 
-    // Bend the floor's normals outwards so that it stands for a dome far higher than the disc: the start stays below the disc.
+    // Bend the floor's normals outwards so that it stands for a dome far higher than the disc: the
+    // start stays below the disc.
     for (int k = 0; k < 4; k++) {
-        const float n[3] = { mesh.position_m[k][0] * .57735f, mesh.position_m[k][1] * .57735f, .57735f };
+        const float n[3] = { mesh.position_m[k][0] * .57735f, mesh.position_m[k][1] * .57735f,
+                             .57735f };
         memcpy(mesh.normal[k], n, sizeof(n));
     }
     rays = rays_of(&mesh);
@@ -278,10 +283,10 @@ static void rays_start_a_hair_above_a_flat_surface_and_never_inside_another(void
     assert_true(start[2] > 0 && start[2] < .5);
     rays_free(rays);
 
-    for (uint32_t i = 0; i < (uint32_t)mesh.n_triangles; i++) // a finer check: without the disc it is lifted
-        if (i >= 2)
-            for (int c = 0; c < 3; c++)
-                mesh.position_m[mesh.triangle[i][c]][2] = -.1f;
+    // With the disc out of the way it is lifted further.
+    for (int i = 2; i < mesh.n_triangles; i++)
+        for (int c = 0; c < 3; c++)
+            mesh.position_m[mesh.triangle[i][c]][2] = -.1f;
     rays = rays_of(&mesh);
     rays_start(rays, 0, (const float[2]){ 0, .5f }, start);
     assert_true(start[2] > .5);
@@ -316,8 +321,10 @@ static void mesh_without_triangles_blocks_nothing(void **state)
     struct mesh mesh = { 0 };
     struct rays *rays = rays_of(&mesh);
     struct ray_hit hit;
-    assert_false(rays_blocked(rays, (const float[3]){ 0 }, (const float[3]){ 1, 0, 0 }, 0, INFINITY));
-    assert_false(rays_hit(rays, (const float[3]){ 0 }, (const float[3]){ 1, 0, 0 }, 0, INFINITY, &hit));
+    assert_false(
+        rays_blocked(rays, (const float[3]){ 0 }, (const float[3]){ 1, 0, 0 }, 0, INFINITY));
+    assert_false(
+        rays_hit(rays, (const float[3]){ 0 }, (const float[3]){ 1, 0, 0 }, 0, INFINITY, &hit));
     rays_free(rays);
     rays_free(NULL);
 }

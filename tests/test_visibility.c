@@ -1,4 +1,5 @@
-// tests/test_visibility.c - masks and light bits are those of geometry one can work out by hand, and of brute force.
+// tests/test_visibility.c - masks and light bits are those of geometry one can work out by hand,
+// and of brute force.
 #include "solver/random.h"
 #include "solver/take/log.h"
 #include "solver/visibility.h"
@@ -50,8 +51,14 @@ static void texel_point(const struct scene *s, int i, double point[3], double no
 
 static struct camera camera_at(const double centre_m[3], const double target_m[3], double focal_px)
 {
-    struct camera c = { .name = "view", .width_px = 300, .height_px = 200, .model = CAMERA_BROWN,
-                        .fx = focal_px, .fy = focal_px, .cx = 150, .cy = 100 };
+    struct camera c = { .name = "view",
+                        .width_px = 300,
+                        .height_px = 200,
+                        .model = CAMERA_BROWN,
+                        .fx = focal_px,
+                        .fy = focal_px,
+                        .cx = 150,
+                        .cy = 100 };
     camera_look_at(&c, centre_m, target_m, (const double[3]){ 0, .6, .8 });
     return c;
 }
@@ -64,13 +71,14 @@ static uint8_t *mask_of(const struct scene *s, const struct camera *camera, int 
     return mask;
 }
 
-// ---- cameras ------------------------------------------------------------------------------------------------------------
+// ---- cameras ----
 
 static void every_texel_of_a_coarse_sphere_is_judged_by_its_own_normal(void **state)
 {
     (void)state;
     struct scene s = scene_of(ray_mesh_sphere(12, 6), 128);
-    const struct camera camera = camera_at((const double[3]){ 3, 1, 2 }, (const double[3]){ 0 }, 200);
+    const struct camera camera =
+        camera_at((const double[3]){ 3, 1, 2 }, (const double[3]){ 0 }, 200);
     uint8_t *mask = mask_of(&s, &camera, 1);
     int n[256] = { 0 };
     for (int i = 0; i < s.texels.n; i++) {
@@ -79,7 +87,9 @@ static void every_texel_of_a_coarse_sphere_is_judged_by_its_own_normal(void **st
         vec3_sub(view, camera.centre_m, point);
         vec3_normalise(view);
         const double cosine = vec3_dot(view, normal);
-        assert_int_equal(mask[i], cosine <= 0 ? MASK_OCCLUDED : cosine < .15 ? MASK_GRAZING : MASK_VISIBLE);
+        assert_int_equal(mask[i], cosine <= 0    ? MASK_OCCLUDED
+                                  : cosine < .15 ? MASK_GRAZING
+                                                 : MASK_VISIBLE);
         n[mask[i]]++;
     }
     assert_true(n[MASK_VISIBLE] > 100 && n[MASK_GRAZING] > 100 && n[MASK_OCCLUDED] > 100);
@@ -91,7 +101,8 @@ static void texels_outside_the_image_or_behind_the_camera_are_outside(void **sta
 {
     (void)state;
     struct scene s = scene_of(ray_mesh_sphere(48, 24), 64);
-    const struct camera camera = camera_at((const double[3]){ 3, 1, 2 }, (const double[3]){ 0 }, 600); // beyond all four borders
+    const struct camera camera = camera_at((const double[3]){ 3, 1, 2 }, (const double[3]){ 0 },
+                                           600); // beyond all four borders
     uint8_t *mask = mask_of(&s, &camera, 1);
     int n_outside = 0;
     for (int i = 0; i < s.texels.n; i++) {
@@ -104,7 +115,8 @@ static void texels_outside_the_image_or_behind_the_camera_are_outside(void **sta
     }
     assert_in_range(n_outside, s.texels.n / 10, s.texels.n * 9 / 10);
     free(mask);
-    const struct camera away = camera_at((const double[3]){ 3, 0, 0 }, (const double[3]){ 6, 0, 0 }, 600);
+    const struct camera away =
+        camera_at((const double[3]){ 3, 0, 0 }, (const double[3]){ 6, 0, 0 }, 600);
     mask = mask_of(&s, &away, 1);
     for (int i = 0; i < s.texels.n; i++)
         assert_int_equal(mask[i], MASK_OUTSIDE);
@@ -112,7 +124,8 @@ static void texels_outside_the_image_or_behind_the_camera_are_outside(void **sta
     scene_free(&s);
 }
 
-// Floor texels inside a circle are hidden, outside it seen; only within one texel of its line either may be.
+// Floor texels inside a circle are hidden, outside it seen; only within one texel of its line
+// either may be.
 static void check_circle(const struct scene *s, const bool *seen, double x, double y, double radius)
 {
     int n_inside = 0, n_outside = 0;
@@ -125,7 +138,10 @@ static void check_circle(const struct scene *s, const bool *seen, double x, doub
         if (fabs(beyond) < s->texels.texel_size_m)
             continue;
         assert_int_equal(seen[i], beyond > 0);
-        n_inside += beyond < 0, n_outside += beyond > 0;
+        if (beyond < 0)
+            n_inside++;
+        else
+            n_outside++;
     }
     assert_true(n_inside > 50 && n_outside > 50);
 }
@@ -136,7 +152,8 @@ static void disc_hides_the_floor_from_a_camera_within_a_texel_of_its_outline(voi
 {
     (void)state;
     struct scene s = scene_of(ray_mesh_disc_above_floor(.5, .3, RIM), 128);
-    const struct camera camera = camera_at((const double[3]){ .4, .2, 2 }, (const double[3]){ .1, 0, 0 }, 60);
+    const struct camera camera =
+        camera_at((const double[3]){ .4, .2, 2 }, (const double[3]){ .1, 0, 0 }, 60);
     uint8_t *mask = mask_of(&s, &camera, 1);
     bool *seen = calloc((size_t)s.texels.n, sizeof(bool));
     for (int i = 0; i < s.texels.n; i++) {
@@ -145,7 +162,8 @@ static void disc_hides_the_floor_from_a_camera_within_a_texel_of_its_outline(voi
         if (s.texels.position_m[i][2] > 0)
             assert_true(seen[i]); // the disc's upper side
     }
-    // From (x, y, H) the disc at height h falls on the floor as a circle, stretched by H / (H - h) about the foot of the camera.
+    // From (x, y, H) the disc at height h falls on the floor as a circle, stretched by H / (H - h)
+    // about the foot of the camera.
     const double stretch = 2 / (2 - .5);
     check_circle(&s, seen, .4 - .4 * stretch, .2 - .2 * stretch, .3 * stretch);
     free(seen);
@@ -153,9 +171,10 @@ static void disc_hides_the_floor_from_a_camera_within_a_texel_of_its_outline(voi
     scene_free(&s);
 }
 
-// ---- lights -------------------------------------------------------------------------------------------------------------
+// ---- lights ----
 
-// n lights in random directions, all but every third at 1 .. 3 m, under a rotation and about a centre of no special kind.
+// n lights in random directions, all but every third at 1 .. 3 m, under a rotation and about a
+// centre of no special kind.
 static struct lights random_lights(int n, uint64_t seed)
 {
     struct lights l;
@@ -298,7 +317,8 @@ static void lights_below_the_horizon_cost_no_ray(void **state)
     scene_free(&s);
 }
 
-static void assert_light_equal(const struct light_visibility *a, const struct light_visibility *b, int light)
+static void assert_light_equal(const struct light_visibility *a, const struct light_visibility *b,
+                               int light)
 {
     for (int i = 0; i < a->n_texels; i++) {
         assert_int_equal(bit_of(a, i, light), bit_of(b, i, light));
@@ -308,7 +328,8 @@ static void assert_light_equal(const struct light_visibility *a, const struct li
     }
 }
 
-static bool light_differs(const struct light_visibility *a, const struct light_visibility *b, int light)
+static bool light_differs(const struct light_visibility *a, const struct light_visibility *b,
+                          int light)
 {
     for (int i = 0; i < a->n_texels; i++)
         if (bit_of(a, i, light) != bit_of(b, i, light))
@@ -320,8 +341,9 @@ static bool light_differs(const struct light_visibility *a, const struct light_v
 static void turn(struct lights *l, int i, double angle_rad)
 {
     double across[3], turned[9];
-    vec3_cross(across, l->dir_probe[i], fabs(l->dir_probe[i][2]) < .9 ? (const double[3]){ 0, 0, 1 } :
-                                                                       (const double[3]){ 1, 0, 0 });
+    vec3_cross(across, l->dir_probe[i],
+               fabs(l->dir_probe[i][2]) < .9 ? (const double[3]){ 0, 0, 1 }
+                                             : (const double[3]){ 1, 0, 0 });
     vec3_normalise(across);
     for (int c = 0; c < 3; c++)
         across[c] *= angle_rad;
@@ -337,17 +359,19 @@ static void refresh_retraces_the_lights_that_moved_and_no_other(void **state)
     struct lights l = random_lights(20, 1);
     struct light_visibility v = trace(&s, &l, NULL, 1, 1), before = trace(&s, &l, NULL, 1, 1);
     const int64_t n_rays = v.n_rays;
-    assert_int_equal(light_visibility_refresh(&v, s.rays, &s.texels, &l, NULL, .5 * degree, 5, 1), 0);
+    assert_int_equal(light_visibility_refresh(&v, s.rays, &s.texels, &l, NULL, .5 * degree, 5, 1),
+                     0);
     assert_int_equal(v.n_rays, n_rays);
 
     turn(&l, 3, .3 * degree); // directional, too little
     turn(&l, 5, .3 * degree); // near, too little
     turn(&l, 6, 2 * degree);  // directional
     turn(&l, 7, 2 * degree);  // near
-    l.inverse_distance[8] *= 2; // comes nearer along its own line: moves only as seen from the corners
+    l.inverse_distance[8] *= 2; // nearer along its own line: moves only as seen from the corners
     l.inverse_distance[9] = 1; // was directional
     struct light_visibility fresh = trace(&s, &l, NULL, 1, 1);
-    assert_int_equal(light_visibility_refresh(&v, s.rays, &s.texels, &l, NULL, .5 * degree, 5, 1), 4);
+    assert_int_equal(light_visibility_refresh(&v, s.rays, &s.texels, &l, NULL, .5 * degree, 5, 1),
+                     4);
     assert_true(v.n_rays > n_rays && v.n_rays < n_rays + n_rays / 3);
     for (int i = 0; i < l.n; i++)
         assert_light_equal(&v, i >= 6 && i <= 9 ? &fresh : &before, i);
@@ -355,11 +379,13 @@ static void refresh_retraces_the_lights_that_moved_and_no_other(void **state)
         assert_true(light_differs(&fresh, &before, i));
 
     turn(&l, 3, .3 * degree); // small steps add up
-    assert_int_equal(light_visibility_refresh(&v, s.rays, &s.texels, &l, NULL, .5 * degree, 5, 1), 1);
+    assert_int_equal(light_visibility_refresh(&v, s.rays, &s.texels, &l, NULL, .5 * degree, 5, 1),
+                     1);
     light_visibility_free(&fresh);
     fresh = trace(&s, &l, NULL, 1, 1);
     assert_light_equal(&v, &fresh, 3);
-    assert_int_equal(light_visibility_refresh(&v, s.rays, &s.texels, &l, NULL, .5 * degree, 5, 1), 0);
+    assert_int_equal(light_visibility_refresh(&v, s.rays, &s.texels, &l, NULL, .5 * degree, 5, 1),
+                     0);
     light_visibility_free(&fresh);
     light_visibility_free(&before);
     light_visibility_free(&v);
@@ -367,7 +393,7 @@ static void refresh_retraces_the_lights_that_moved_and_no_other(void **state)
     scene_free(&s);
 }
 
-// ---- soft ---------------------------------------------------------------------------------------------------------------
+// ---- soft ----
 
 // A black panorama with one rectangle of light, [x0,x1) x [y0,y1).
 static struct panorama panorama_with(int width, int x0, int y0, int x1, int y1)
@@ -419,7 +445,8 @@ static void soft_shadow_grows_from_none_to_all_through_the_penumbra(void **state
             assert_int_equal(soft, 255);
         else if (radius < .4 - half_width - .001)
             assert_int_equal(soft, 0);
-        const bool in_row = point[1] > 0 && point[1] < 2. / 128; // the first row of texels beyond y = 0
+        // The first row of texels beyond y = 0.
+        const bool in_row = point[1] > 0 && point[1] < 2. / 128;
         if (point[2] == 0 && point[0] > 0 && in_row) {
             row[n_row][0] = point[0];
             row[n_row++][1] = soft;
@@ -448,7 +475,8 @@ static void soft_share_is_by_energy(void **state)
         // Two lamps of one pixel; their energies are 3 : 1.
         const int a[2] = { 40, 8 }, b[2] = { 88, same_row ? 8 : 6 };
         struct panorama p = panorama_with(128, a[0], a[1], a[0] + 1, a[1] + 1);
-        const double ratio = panorama_solid_angle(128, 64, a[1]) / panorama_solid_angle(128, 64, b[1]) / 3;
+        const double ratio =
+            panorama_solid_angle(128, 64, a[1]) / panorama_solid_angle(128, 64, b[1]) / 3;
         for (int c = 0; c < 3; c++)
             p.image.data[(b[1] * 128 + b[0]) * 3 + c] = (float)(10 * ratio);
         struct lights l = whole_sky(&p);
@@ -465,7 +493,8 @@ static void soft_share_is_by_energy(void **state)
                 double dir[3];
                 panorama_direction(128, 64, lamp[0] + .5, lamp[1] + .5, dir);
                 mat3_mul_vec(dir, l.world_from_probe, dir);
-                inside[k] = .2 - hypot(point[0] + .5 * dir[0] / dir[2], point[1] + .5 * dir[1] / dir[2]);
+                inside[k] =
+                    .2 - hypot(point[0] + .5 * dir[0] / dir[2], point[1] + .5 * dir[1] / dir[2]);
             }
             const double pixel = .5 * 2 * PI / 128 * 2; // a lamp's own penumbra, generously
             if (inside[0] > pixel && inside[1] < -pixel) {
@@ -538,7 +567,8 @@ static void thread_count_changes_no_byte_and_the_seed_decides(void **state)
     assert_int_equal(one.n_rays, three.n_rays);
     assert_int_equal(light_visibility_trace(&other, s.rays, &s.texels, &l, &p, 5, 6, 1), 0);
     assert_memory_not_equal(one.soft, other.soft, n_soft);
-    const struct camera camera = camera_at((const double[3]){ .4, .1, .2 }, (const double[3]){ 0 }, 250);
+    const struct camera camera =
+        camera_at((const double[3]){ .4, .1, .2 }, (const double[3]){ 0 }, 250);
     uint8_t *mask_one = mask_of(&s, &camera, 1), *mask_three = mask_of(&s, &camera, 3);
     assert_memory_equal(mask_one, mask_three, (size_t)s.texels.n);
     free(mask_one);
@@ -551,7 +581,7 @@ static void thread_count_changes_no_byte_and_the_seed_decides(void **state)
     scene_free(&s);
 }
 
-// ---- files and refusals -------------------------------------------------------------------------------------------------
+// ---- files and refusals ----
 
 static void files_hold_what_was_traced(void **state)
 {
@@ -579,7 +609,8 @@ static void files_hold_what_was_traced(void **state)
     free(bytes);
     unlink(path);
 
-    const struct camera camera = camera_at((const double[3]){ .4, .1, .2 }, (const double[3]){ 0 }, 250);
+    const struct camera camera =
+        camera_at((const double[3]){ .4, .1, .2 }, (const double[3]){ 0 }, 250);
     uint8_t *mask = mask_of(&s, &camera, 1);
     snprintf(path, sizeof(path), "%s/mask.png", dir);
     assert_int_equal(visibility_write_mask_png(mask, &s.texels, path), 0);
@@ -588,7 +619,8 @@ static void files_hold_what_was_traced(void **state)
     assert_true(image.width == 32 && image.height == 32);
     for (int i = 0; i < 32 * 32; i++) {
         const int texel = s.texels.index[i];
-        assert_int_equal(lround(255 * image.data[i * image.n_channels]), texel < 0 ? MASK_OUTSIDE : mask[texel]);
+        assert_int_equal(lround(255 * image.data[i * image.n_channels]),
+                         texel < 0 ? MASK_OUTSIDE : mask[texel]);
     }
     image_free(&image);
     unlink(path);
@@ -621,16 +653,15 @@ static void soft_without_what_it_needs_is_refused_with_one_line(void **state)
         const struct lights *lights;
         const struct panorama *panorama;
         int n_sub;
-    } bad[] = { { &l, &p, 0 },   { &l, &p, 2 },     { &l, &p, 17 },
-                { &l, NULL, 4 }, { &loose, &p, 4 }, { &l, &small, 4 },
-                { &l, &large, 4 }, { &torn, &p, 4 } };
+    } bad[] = { { &l, &p, 0 },     { &l, &p, 2 },     { &l, &p, 17 },    { &l, NULL, 4 },
+                { &loose, &p, 4 }, { &l, &small, 4 }, { &l, &large, 4 }, { &torn, &p, 4 } };
     for (size_t i = 0; i < sizeof(bad) / sizeof(bad[0]); i++) {
         int n_lines = 0;
         struct light_visibility v;
         memset(&v, 1, sizeof(v));
         log_set_hook(count_line, &n_lines);
-        assert_int_equal(light_visibility_trace(&v, s.rays, &s.texels, bad[i].lights, bad[i].panorama,
-                                                bad[i].n_sub, 1, 1),
+        assert_int_equal(light_visibility_trace(&v, s.rays, &s.texels, bad[i].lights,
+                                                bad[i].panorama, bad[i].n_sub, 1, 1),
                          -EINVAL);
         log_set_hook(NULL, NULL);
         assert_int_equal(n_lines, 1);

@@ -1,4 +1,5 @@
-// solver/commands/visibility.c - rigsolve visibility: which cameras and lights see which texel, as pictures and numbers.
+// solver/commands/visibility.c - rigsolve visibility: which cameras and lights see which texel, as
+// pictures and numbers.
 #include "solver/cameras.h"
 #include "solver/commands/commands.h"
 #include "solver/lights.h"
@@ -24,10 +25,11 @@
 #include <time.h>
 #include <unistd.h>
 
-// ---- arguments ----------------------------------------------------------------------------------------------------------
+// ---- arguments ----
 
 struct settings {
-    const char *take, *mesh, *cameras, *panorama, *lights, *world_from_probe, *images, *out, *overlay;
+    const char *take, *mesh, *cameras, *panorama, *lights, *world_from_probe, *images, *out,
+        *overlay;
     int n_lights, texture, n_sub, n_threads;
     uint64_t seed;
     double grazing_cos, distance_m, centre_m[3];
@@ -35,9 +37,21 @@ struct settings {
 };
 
 enum {
-    OPTION_MESH = 256, OPTION_CAMERAS, OPTION_PANORAMA, OPTION_LIGHTS, OPTION_WORLD_FROM_PROBE,
-    OPTION_TEXTURE, OPTION_SOFT, OPTION_GRAZING, OPTION_CENTRE, OPTION_DISTANCE, OPTION_IMAGES,
-    OPTION_OVERLAY, OPTION_THREADS, OPTION_SEED, OPTION_JSON,
+    OPTION_MESH = 256,
+    OPTION_CAMERAS,
+    OPTION_PANORAMA,
+    OPTION_LIGHTS,
+    OPTION_WORLD_FROM_PROBE,
+    OPTION_TEXTURE,
+    OPTION_SOFT,
+    OPTION_GRAZING,
+    OPTION_CENTRE,
+    OPTION_DISTANCE,
+    OPTION_IMAGES,
+    OPTION_OVERLAY,
+    OPTION_THREADS,
+    OPTION_SEED,
+    OPTION_JSON,
 };
 
 static const struct argp_option options[] = {
@@ -46,20 +60,24 @@ static const struct argp_option options[] = {
     { "cameras", OPTION_CAMERAS, "PATH", 0, "calibrated views: a COLMAP folder", 1 },
     { "panorama", OPTION_PANORAMA, "FILE", 0, "HDR panorama the lights are cut from", 1 },
     { "lights", OPTION_LIGHTS, "N|FILE", 0,
-      "how many lights to cut from the panorama (a power of two; default 256), or a lights.json", 1 },
+      "how many lights to cut from the panorama (a power of two; default 256), or a lights.json",
+      1 },
     { "world-from-probe", OPTION_WORLD_FROM_PROBE, "FILE", 0,
       "JSON with world_from_probe (3x3) and perhaps centre_m; default: the take's start.json", 1 },
     { "centre", OPTION_CENTRE, "X,Y,Z", 0,
       "where the panorama was taken, metres; default: the middle of the mesh's bounding box", 1 },
     { "distance", OPTION_DISTANCE, "M", 0,
-      "distance of all lights from there, metres; default: infinity (or what lights.json says)", 1 },
+      "distance of all lights from there, metres; default: infinity (or what lights.json says)",
+      1 },
     { "images", OPTION_IMAGES, "DIR", 0, "the views' pictures, for --overlay", 1 },
     { 0, 0, 0, 0, "What is traced", 2 },
     { "texture", OPTION_TEXTURE, "N", 0, "N x N texels (default 512)", 2 },
     { "grazing", OPTION_GRAZING, "COS", 0,
       "views flatter than this cosine count as grazing (default .15)", 2 },
     { "soft", OPTION_SOFT, "K", 0,
-      "soft visibility from K = 4..16 directions within each light's own panorama pixels; 0: off (default)", 2 },
+      "soft visibility from K = 4..16 directions within each light's own panorama pixels; 0: off "
+      "(default)",
+      2 },
     { "threads", OPTION_THREADS, "N", 0, "default: all cores; the result is the same", 2 },
     { "seed", OPTION_SEED, "N", 0, "of the soft directions (default 1)", 2 },
     { 0, 0, 0, 0, "Output", 3 },
@@ -72,10 +90,13 @@ static const struct argp_option options[] = {
 
 static const char doc[] =
     "Trace which cameras and which lights see which texel of the mesh's atlas.\v"
-    "TAKE is a folder with geometry/, linear/, panorama.exr and perhaps start.json; or name the pieces one by one. "
+    "TAKE is a folder with geometry/, linear/, panorama.exr and perhaps start.json; or name the "
+    "pieces one by one. "
     "Without a panorama or lights only the cameras are traced.\n\n"
-    "DIR/visibility/<view>.png: 255 visible, 170 grazing, 85 occluded or facing away, 0 outside the image. "
-    "coverage.png: share of the views that see a texel. shadow.png: share of the light above a texel's horizon that "
+    "DIR/visibility/<view>.png: 255 visible, 170 grazing, 85 occluded or facing away, 0 outside "
+    "the image. "
+    "coverage.png: share of the views that see a texel. shadow.png: share of the light above a "
+    "texel's horizon that "
     "reaches it. lights.bin: one bit per texel and light (solver/visibility.h).\n\n"
     "Exit status: 0 done, 1 failed, 2 usage, 3 done, but no camera sees the mesh.";
 
@@ -86,13 +107,13 @@ static long long integer_of(struct argp_state *state, const char *option, const 
     errno = 0;
     const long long value = strtoll(text, &end, 10);
     if (end == text || *end || errno || value < least || value > most)
-        argp_error(state, "--%s '%s': expected a whole number from %lld to %lld", option, text, least,
-                   most);
+        argp_error(state, "--%s '%s': expected a whole number from %lld to %lld", option, text,
+                   least, most);
     return value;
 }
 
-static double number_of(struct argp_state *state, const char *option, const char *text, double least,
-                        double most)
+static double number_of(struct argp_state *state, const char *option, const char *text,
+                        double least, double most)
 {
     char *end;
     const double value = strtod(text, &end);
@@ -108,7 +129,8 @@ static void parse_centre(struct argp_state *state, const char *text, double cent
         char *end;
         centre_m[c] = strtod(at, &end);
         if (end == at || *end != (c < 2 ? ',' : '\0') || !(fabs(centre_m[c]) <= 1e9))
-            argp_error(state, "--centre '%s': expected three numbers in metres, as 0,0.1,1.2", text);
+            argp_error(state, "--centre '%s': expected three numbers in metres, as 0,0.1,1.2",
+                       text);
         at = end + 1;
     }
 }
@@ -132,7 +154,8 @@ static error_t parse_option(int key, char *text, struct argp_state *state)
         if (!s->lights) {
             s->n_lights = (int)integer_of(state, "lights", text, 1, LIGHTS_MAX);
             if (s->n_lights & (s->n_lights - 1))
-                argp_error(state, "--lights '%s': expected a power of two up to %d, or a lights.json",
+                argp_error(state,
+                           "--lights '%s': expected a power of two up to %d, or a lights.json",
                            text, LIGHTS_MAX);
         }
         return 0;
@@ -194,7 +217,7 @@ static error_t parse_option(int key, char *text, struct argp_state *state)
     }
 }
 
-// ---- what is loaded -----------------------------------------------------------------------------------------------------
+// ---- what is loaded ----
 
 struct scene {
     struct take *take;
@@ -257,7 +280,8 @@ static int read_world_from_probe(const char *path, struct lights *l, bool *has_c
             gram[3 * i + j] = vec3_dot(rotation + 3 * i, rotation + 3 * j) - (i == j);
     for (int i = 0; i < 9; i++)
         if (!(fabs(gram[i]) < 1e-4) || !(mat3_det(rotation) > 0)) {
-            log_error("visibility: %s: world_from_probe is not a rotation (determinant %g): expected three "
+            log_error("visibility: %s: world_from_probe is not a rotation (determinant %g): "
+                      "expected three "
                       "orthonormal rows, right-handed",
                       path, mat3_det(rotation));
             err = -EINVAL;
@@ -285,7 +309,8 @@ static int load_lights(struct scene *scene, const struct settings *s)
     if (err)
         return err;
     struct lights *l = &scene->lights;
-    err = s->lights ? lights_read_json(l, s->lights) : lights_median_cut(l, &scene->panorama, s->n_lights);
+    err = s->lights ? lights_read_json(l, s->lights)
+                    : lights_median_cut(l, &scene->panorama, s->n_lights);
     if (err)
         return err;
     bool has_centre = s->lights != NULL;
@@ -294,7 +319,8 @@ static int load_lights(struct scene *scene, const struct settings *s)
         if (err)
             return err;
     } else if (!s->lights) {
-        log_warning("visibility: no --world-from-probe: the panorama is taken to have the world's axes");
+        log_warning(
+            "visibility: no --world-from-probe: the panorama is taken to have the world's axes");
     }
     for (int c = 0; c < 3; c++) {
         if (s->has_centre)
@@ -329,7 +355,7 @@ static int load(struct scene *scene, struct settings *s)
     return load_lights(scene, s);
 }
 
-// ---- cameras ------------------------------------------------------------------------------------------------------------
+// ---- cameras ----
 
 struct view_report {
     int n_visible, n_grazing, n_occluded, n_outside;
@@ -362,7 +388,8 @@ static char *path_in(const char *dir, const char *name, const char *extension)
     return path;
 }
 
-static int write_bytes_png(const char *dir, const char *name, const struct texels *t, const uint8_t *bytes)
+static int write_bytes_png(const char *dir, const char *name, const struct texels *t,
+                           const uint8_t *bytes)
 {
     char *path = path_in(dir, name, "png");
     const int err = path ? visibility_write_mask_png(bytes, t, path) : -ENOMEM;
@@ -413,7 +440,7 @@ done:
     return err;
 }
 
-// ---- lights -------------------------------------------------------------------------------------------------------------
+// ---- lights ----
 
 struct shadow_job {
     const struct scene *scene;
@@ -436,8 +463,9 @@ static void shade_texels(void *arg, int64_t begin, int64_t end, int worker)
             struct light_at at;
             light_at_point(l, k, point, &at);
             const double *irradiance = l->irradiance[k];
-            const double energy = fmax(vec3_dot(normal, at.l), 0) * at.weight *
-                                  (.2126 * irradiance[0] + .7152 * irradiance[1] + .0722 * irradiance[2]);
+            const double energy =
+                fmax(vec3_dot(normal, at.l), 0) * at.weight *
+                (.2126 * irradiance[0] + .7152 * irradiance[1] + .0722 * irradiance[2]);
             const bool bit = v->bits[i * v->words_per_texel + k / 16] >> k % 16 & 1;
             above += energy;
             arrives += energy * (v->soft ? v->soft[i * v->n_lights + k] / 255. : bit);
@@ -447,7 +475,8 @@ static void shade_texels(void *arg, int64_t begin, int64_t end, int worker)
     }
 }
 
-static int trace_lights(struct scene *scene, const struct settings *s, const char *dir, struct report *report)
+static int trace_lights(struct scene *scene, const struct settings *s, const char *dir,
+                        struct report *report)
 {
     const struct texels *t = &scene->texels;
     uint8_t *share = malloc((size_t)t->n), *lit = malloc((size_t)t->n);
@@ -457,8 +486,8 @@ static int trace_lights(struct scene *scene, const struct settings *s, const cha
         goto done;
     const double begin_s = now_s();
     err = light_visibility_trace(&scene->visibility, scene->rays, t, &scene->lights,
-                                 scene->panorama.image.data ? &scene->panorama : NULL, s->n_sub, s->seed,
-                                 s->n_threads);
+                                 scene->panorama.image.data ? &scene->panorama : NULL, s->n_sub,
+                                 s->seed, s->n_threads);
     if (err)
         goto done;
     report->light_s = now_s() - begin_s;
@@ -476,7 +505,7 @@ done:
     return err;
 }
 
-// ---- overlays -----------------------------------------------------------------------------------------------------------
+// ---- overlays ----
 
 struct silhouette_job {
     const struct rays *rays;
@@ -496,7 +525,8 @@ static void trace_rows(void *arg, int64_t begin, int64_t end, int worker)
             double dir[3] = { 0 };
             const bool ok = camera_ray(camera, (const double[2]){ x + .5, (double)y + .5 }, dir);
             const float d[3] = { (float)dir[0], (float)dir[1], (float)dir[2] };
-            job->hit[y * camera->width_px + x] = ok && rays_blocked(job->rays, origin, d, 0, INFINITY);
+            job->hit[y * camera->width_px + x] =
+                ok && rays_blocked(job->rays, origin, d, 0, INFINITY);
         }
 }
 
@@ -529,8 +559,8 @@ static bool is_hit(const uint8_t *hit, int width, int height, int x, int y)
     return x >= 0 && y >= 0 && x < width && y < height && hit[y * width + x];
 }
 
-// The picture, a small one magnified, with a line along the edge between hit and missed pixels: on the missed ones' side, so that no
-// pixel of the subject is painted over.
+// The picture, a small one magnified, with a line along the edge between hit and missed pixels: on
+// the missed ones' side, so that no pixel of the subject is painted over.
 static int draw_outline(const struct image *image, const uint8_t *hit, const char *path)
 {
     const int width = image->width, height = image->height;
@@ -544,7 +574,8 @@ static int draw_outline(const struct image *image, const uint8_t *hit, const cha
     for (int y = 0; y < out.height; y++)
         for (int x = 0; x < out.width; x++) {
             const int sx = x / scale, sy = y / scale, ix = x % scale, iy = y % scale;
-            const float *from = image->data + ((size_t)sy * (size_t)width + (size_t)sx) * (size_t)image->n_channels;
+            const float *from =
+                image->data + ((size_t)sy * (size_t)width + (size_t)sx) * (size_t)image->n_channels;
             float *to = out.data + ((size_t)y * (size_t)out.width + (size_t)x) * 3;
             const bool line = !hit[sy * width + sx] &&
                               ((ix == 0 && is_hit(hit, width, height, sx - 1, sy)) ||
@@ -641,7 +672,7 @@ static int draw_overlays(const struct scene *scene, const struct settings *s, st
     return err;
 }
 
-// ---- report -------------------------------------------------------------------------------------------------------------
+// ---- report ----
 
 static double mrays_per_s(const struct scene *scene, const struct report *report)
 {
@@ -666,8 +697,8 @@ static void print_text(const struct scene *scene, const struct report *report)
     printf("%-24s %9s %9s %9s %9s\n", "view", "visible", "grazing", "occluded", "outside");
     for (int i = 0; i < scene->cameras.n; i++) {
         const struct view_report *view = &report->view[i];
-        printf("%-24s %9d %9d %9d %9d", scene->cameras.view[i].name, view->n_visible, view->n_grazing,
-               view->n_occluded, view->n_outside);
+        printf("%-24s %9d %9d %9d %9d", scene->cameras.view[i].name, view->n_visible,
+               view->n_grazing, view->n_occluded, view->n_outside);
         if (view->drawn && view->iou >= 0)
             printf("  silhouette IoU %.4f", view->iou);
         putchar('\n');
@@ -676,7 +707,8 @@ static void print_text(const struct scene *scene, const struct report *report)
            scene->mesh.n_triangles, scene->texels.n, scene->texels.size, scene->texels.size,
            report->n_seen_by_none, report->camera_s);
     if (v->n_lights)
-        printf("%d lights: %lld rays in %.2f s (%.2f Mray/s), %.1f %% below the horizon, %lld bytes; %d texels "
+        printf("%d lights: %lld rays in %.2f s (%.2f Mray/s), %.1f %% below the horizon, %lld "
+               "bytes; %d texels "
                "lit by nothing\n",
                v->n_lights, (long long)v->n_rays, report->light_s, mrays_per_s(scene, report),
                below_horizon_percent(v), (long long)bytes_of(v), report->n_lit_by_none);
@@ -726,7 +758,8 @@ static int print_json(const struct scene *scene, const struct report *report)
     return 0;
 }
 
-// 3 where every texel of every view is hidden or outside: the result exists, but mesh and cameras do not belong together.
+// 3 where every texel of every view is hidden or outside: the result exists, but mesh and cameras
+// do not belong together.
 static int judge(const struct scene *scene, const struct report *report)
 {
     int64_t n_visible = 0, n_outside = 0;
@@ -737,7 +770,8 @@ static int judge(const struct scene *scene, const struct report *report)
     if (n_visible)
         return EXIT_DONE;
     const double asked = (double)scene->cameras.n * scene->texels.n;
-    log_error("visibility: none of %d cameras sees the mesh (%.0f %% of its texels fall outside the images, the rest face "
+    log_error("visibility: none of %d cameras sees the mesh (%.0f %% of its texels fall outside "
+              "the images, the rest face "
               "away or are blocked): are mesh and cameras in the same axes and units?",
               scene->cameras.n, asked > 0 ? 100 * (double)n_outside / asked : 0);
     return EXIT_NOT_TRUSTED;
@@ -745,7 +779,10 @@ static int judge(const struct scene *scene, const struct report *report)
 
 int command_visibility(int argc, char **argv)
 {
-    struct settings s = { .n_lights = 256, .texture = 512, .n_sub = 1, .seed = 1,
+    struct settings s = { .n_lights = 256,
+                          .texture = 512,
+                          .n_sub = 1,
+                          .seed = 1,
                           .grazing_cos = MASK_GRAZING_COS_PERCENT / 100. };
     const struct argp argp = { options, parse_option, "[TAKE]", doc, NULL, NULL, NULL };
     argp_parse(&argp, argc, argv, 0, NULL, &s);

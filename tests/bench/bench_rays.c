@@ -1,5 +1,5 @@
-// tests/bench/bench_rays.c - shadow bits of a million texel-light pairs on 100,000 triangles: rays per second, memory, and whether
-// Embree and a brute-force intersector in double agree.
+// tests/bench/bench_rays.c - shadow bits of a million texel-light pairs on 100,000 triangles: rays
+// per second, memory, and whether Embree and a brute-force intersector in double agree.
 #include "solver/parallel.h"
 #include "solver/rays.h"
 #include "solver/take/log.h"
@@ -40,7 +40,8 @@ static struct lights lights_all_round(void)
     if (lights_new(&l, N_LIGHTS))
         abort();
     for (int i = 0; i < N_LIGHTS; i++) {
-        const double z = 1 - (2 * i + 1.) / N_LIGHTS, lon = 2.399963229728653 * i, s = sqrt(1 - z * z);
+        const double z = 1 - (2 * i + 1.) / N_LIGHTS, lon = 2.399963229728653 * i,
+                     s = sqrt(1 - z * z);
         l.dir_probe[i][0] = s * cos(lon), l.dir_probe[i][1] = s * sin(lon), l.dir_probe[i][2] = z;
         l.inverse_distance[i] = .5;
         l.irradiance[i][0] = l.irradiance[i][1] = l.irradiance[i][2] = 1;
@@ -53,7 +54,8 @@ struct timing {
     int64_t n_rays;
 };
 
-static struct timing time_trace(const struct rays *r, const struct texels *t, const struct lights *l, int n_threads)
+static struct timing time_trace(const struct rays *r, const struct texels *t,
+                                const struct lights *l, int n_threads)
 {
     struct timing best = { .cpu_s = INFINITY };
     for (int run = 0; run < N_RUNS; run++) {
@@ -91,7 +93,8 @@ static void compare_rays(void *arg, int64_t begin, int64_t end, int worker)
         if (i % 2) {
             for (int c = 0; c < 3; c++) {
                 const double extent_m = k->mesh->bounds_m[1][c] - k->mesh->bounds_m[0][c];
-                origin[c] = (float)(k->mesh->bounds_m[0][c] + extent_m * random_uniform(1, (uint64_t)i, (uint64_t)c));
+                origin[c] = (float)(k->mesh->bounds_m[0][c] +
+                                    extent_m * random_uniform(1, (uint64_t)i, (uint64_t)c));
                 dir[c] = (float)random_normal(2, (uint64_t)i, (uint64_t)c);
             }
         } else {
@@ -127,14 +130,20 @@ int main(int argc, char **argv)
     const double before_mib = resident_mib(), before_s = seconds(CLOCK_MONOTONIC);
     if (rays_new(&rays, &mesh))
         return 1;
-    const double build_s = seconds(CLOCK_MONOTONIC) - before_s, tree_mib = resident_mib() - before_mib;
+    const double build_s = seconds(CLOCK_MONOTONIC) - before_s,
+                 tree_mib = resident_mib() - before_mib;
     const int64_t n_pairs = (int64_t)texels.n * N_LIGHTS;
-    const struct timing one = time_trace(rays, &texels, &lights, 1), two = time_trace(rays, &texels, &lights, 2);
+    const struct timing one = time_trace(rays, &texels, &lights, 1),
+                        two = time_trace(rays, &texels, &lights, 2);
     const double below_percent = 100 * (1 - (double)one.n_rays / (double)n_pairs);
 
     double diagonal_m[3];
     vec3_sub(diagonal_m, mesh.bounds_m[1], mesh.bounds_m[0]);
-    struct comparison k = { &mesh, rays, &texels, &lights, 1e-6 * vec3_norm(diagonal_m),
+    struct comparison k = { &mesh,
+                            rays,
+                            &texels,
+                            &lights,
+                            1e-6 * vec3_norm(diagonal_m),
                             calloc(N_COMPARED, sizeof(k.answer[0])) };
     if (!k.answer)
         return 1;
@@ -148,30 +157,38 @@ int main(int argc, char **argv)
     const int64_t bytes = (int64_t)texels.n * ((N_LIGHTS + 15) / 16) * 2;
 
     if (json) {
-        printf("{\"n_triangles\":%d,\"n_texels\":%d,\"n_lights\":%d,\"n_pairs\":%lld,\"below_horizon_percent\":%.2f,"
+        printf("{\"n_triangles\":%d,\"n_texels\":%d,\"n_lights\":%d,\"n_pairs\":%lld,\"below_"
+               "horizon_percent\":%.2f,"
                "\"n_rays\":%lld,\"build_s\":%.4f,\"tree_mib\":%.1f,\"bits_bytes\":%lld,"
-               "\"one_thread\":{\"wall_s\":%.4f,\"cpu_s\":%.4f,\"mrays_per_cpu_s\":%.3f,\"mrays_per_wall_s\":%.3f},"
-               "\"two_threads\":{\"wall_s\":%.4f,\"cpu_s\":%.4f,\"mrays_per_cpu_s\":%.3f,\"mrays_per_wall_s\":%.3f},"
-               "\"compared\":%d,\"blocked\":%d,\"different\":%d,\"different_within_edge_tolerance\":%d,"
+               "\"one_thread\":{\"wall_s\":%.4f,\"cpu_s\":%.4f,\"mrays_per_cpu_s\":%.3f,\"mrays_"
+               "per_wall_s\":%.3f},"
+               "\"two_threads\":{\"wall_s\":%.4f,\"cpu_s\":%.4f,\"mrays_per_cpu_s\":%.3f,\"mrays_"
+               "per_wall_s\":%.3f},"
+               "\"compared\":%d,\"blocked\":%d,\"different\":%d,\"different_within_edge_"
+               "tolerance\":%d,"
                "\"edge_tolerance_m\":%.3g}\n",
                mesh.n_triangles, texels.n, N_LIGHTS, (long long)n_pairs, below_percent,
                (long long)one.n_rays, build_s, tree_mib, (long long)bytes, one.wall_s, one.cpu_s,
-               1e-6 * (double)one.n_rays / one.cpu_s, 1e-6 * (double)one.n_rays / one.wall_s, two.wall_s,
-               two.cpu_s, 1e-6 * (double)two.n_rays / two.cpu_s, 1e-6 * (double)two.n_rays / two.wall_s,
-               N_COMPARED, n_blocked, n_different, n_near_edge, k.tolerance_m);
+               1e-6 * (double)one.n_rays / one.cpu_s, 1e-6 * (double)one.n_rays / one.wall_s,
+               two.wall_s, two.cpu_s, 1e-6 * (double)two.n_rays / two.cpu_s,
+               1e-6 * (double)two.n_rays / two.wall_s, N_COMPARED, n_blocked, n_different,
+               n_near_edge, k.tolerance_m);
     } else {
-        printf("%d triangles (tree built in %.3f s, %.1f MiB); %d texels x %d lights = %lld pairs, %.1f %% below the horizon; "
+        printf("%d triangles (tree built in %.3f s, %.1f MiB); %d texels x %d lights = %lld pairs, "
+               "%.1f %% below the horizon; "
                "bits: %lld bytes\n",
-               mesh.n_triangles, build_s, tree_mib, texels.n, N_LIGHTS, (long long)n_pairs, below_percent,
-               (long long)bytes);
-        printf("%-8s %9s %9s %9s %14s %14s   (quickest of %d runs by CPU time)\n", "threads", "rays",
-               "wall s", "CPU s", "Mray/s wall", "Mray/s CPU", N_RUNS);
+               mesh.n_triangles, build_s, tree_mib, texels.n, N_LIGHTS, (long long)n_pairs,
+               below_percent, (long long)bytes);
+        printf("%-8s %9s %9s %9s %14s %14s   (quickest of %d runs by CPU time)\n", "threads",
+               "rays", "wall s", "CPU s", "Mray/s wall", "Mray/s CPU", N_RUNS);
         for (int n = 1; n <= 2; n++) {
             const struct timing *t = n == 1 ? &one : &two;
-            printf("%-8d %9lld %9.4f %9.4f %14.3f %14.3f\n", n, (long long)t->n_rays, t->wall_s, t->cpu_s,
-                   1e-6 * (double)t->n_rays / t->wall_s, 1e-6 * (double)t->n_rays / t->cpu_s);
+            printf("%-8d %9lld %9.4f %9.4f %14.3f %14.3f\n", n, (long long)t->n_rays, t->wall_s,
+                   t->cpu_s, 1e-6 * (double)t->n_rays / t->wall_s,
+                   1e-6 * (double)t->n_rays / t->cpu_s);
         }
-        printf("%d rays against brute force in double: %d blocked, %d answers differ, %d of them within %.2g m of an edge\n",
+        printf("%d rays against brute force in double: %d blocked, %d answers differ, %d of them "
+               "within %.2g m of an edge\n",
                N_COMPARED, n_blocked, n_different, n_near_edge, k.tolerance_m);
     }
     free(k.answer);
