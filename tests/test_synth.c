@@ -80,8 +80,7 @@ static void read_lights(struct lights *out, const char *name)
     assert_int_equal(lights_read_json(out, in_dir(path, name)), 0);
 }
 
-// ---- light
-// -----------------------------------------------------------------------------------------
+// ---- light --------------------------------------------------------------------------------------
 
 // Every light is one pixel of the panorama; every other pixel is black.
 static void check_panorama(const struct image *panorama, const struct lights *lights)
@@ -242,8 +241,7 @@ static void variants_of_the_light_are_what_they_are_called(void **state)
     lights_free(&lights);
 }
 
-// ---- the take
-// --------------------------------------------------------------------------------------
+// ---- the take -----------------------------------------------------------------------------------
 
 static double turn_deg(const double a[9], const double b[9])
 {
@@ -352,8 +350,7 @@ static void rendering_the_truth_gives_the_views(void **state)
     }
 }
 
-// ---- pictures
-// --------------------------------------------------------------------------------------
+// ---- pictures -----------------------------------------------------------------------------------
 
 static void noise_has_its_size_and_the_camera_clips_at_one(void **state)
 {
@@ -421,8 +418,7 @@ static void bright_studios_clip_and_say_where(void **state)
     image_free(&image);
 }
 
-// ---- whole or not there
-// ------------------------------------------------------------------------------
+// ---- whole or not there -------------------------------------------------------------------------
 
 static void compare_files(const char *a, const char *b)
 {
