@@ -261,8 +261,7 @@ bool camera_ray(const struct camera *c, const double uv_px[2], double dir_world[
         q[2] = 1;
     }
     mat3_tmul_vec(dir_world, c->cam_from_world, q);
-    vec3_normalise(dir_world);
-    return true;
+    return isfinite(vec3_normalise(dir_world)); // an absurd focal length leads beyond what a square can hold
 }
 
 void camera_look_at(struct camera *c, const double centre_m[3], const double target_m[3], const double up[3])

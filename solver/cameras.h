@@ -32,10 +32,13 @@ struct cameras {
 // Read any supported format: `path` is a folder (COLMAP text or binary; binary wins when both are there) or a file. The format
 // is known by content. Now: COLMAP. Bundler, Metashape, RealityCapture and Meshroom files are recognised and refused by
 // name (-ENOTSUP). Errors, logged with file, line or offset, found, expected, remedy: -errno of the open, -EINVAL, -ENOTSUP,
-// -ENOMEM. Counts are checked against the file's size before anything is allocated. Points are ignored.
+// -ENOMEM. Counts are checked against the file's size before anything is allocated. Points are ignored. Two images of one stem
+// are refused, and so is text without its last line end: a file cut short must not pass for a shorter one.
 int cameras_read(struct cameras *out, const char *path);
 void cameras_free(struct cameras *c); // leaves it zeroed
 
+// Each view gets a camera of its own and the image name NAME.exr (a take's). dir is made if need be. 0, -ENOTSUP (skew, BROWN's
+// k4, p3 or p4: COLMAP has no model for them; the view is named and nothing written), -EINVAL (a name that is no stem), -errno.
 int cameras_write_colmap_text(const struct cameras *c, const char *dir);   // cameras.txt, images.txt, points3D.txt; atomic each
 int cameras_write_colmap_binary(const struct cameras *c, const char *dir); // the same as .bin
 

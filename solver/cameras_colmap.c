@@ -6,7 +6,6 @@
 #include "solver/take/atomic_file.h"
 #include "solver/take/log.h"
 #include "solver/vec3.h"
-#include "solver/whole_file.h"
 
 #include <errno.h>
 #include <inttypes.h>
@@ -668,11 +667,9 @@ int cameras_colmap_read(struct cameras *out, const struct cameras_source *s)
             path[i] = NULL;
             goto fail;
         }
-        err = whole_file_read(&data[i], &n[i], path[i], max_file_bytes);
-        if (err) {
-            log_error("cameras: cannot read %s: %s", path[i], strerror(-err));
+        err = file_read(&data[i], &n[i], path[i], max_file_bytes);
+        if (err)
             goto fail;
-        }
     }
     err = binary ? cameras_parse_colmap_binary(out, data[0], n[0], path[0], data[1], n[1], path[1])
                  : cameras_parse_colmap_text(out, data[0], n[0], path[0], data[1], n[1], path[1]);

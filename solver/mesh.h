@@ -2,7 +2,8 @@
 //
 // Vertices are split where UV or normal differ; vertices at one place share a `point`. UV origin is bottom-left (OBJ); glTF's
 // top-left is converted on import. Node transforms are applied; several meshes are merged; positions are kept in the
-// file's units and axes (metres are the caller's promise).
+// file's units and axes (metres are the caller's promise). A triangle without UVs in a mesh that has some: all its corners are
+// at UV (0, 0).
 #pragma once
 #include <stdbool.h>
 #include <stddef.h>
@@ -35,7 +36,8 @@ struct mesh_check {
 
 // Read a mesh and check it. check may be NULL. Errors, each logged with file, place, found, expected, remedy:
 // -errno of the open, -EINVAL (broken, truncated, no triangles, no UVs, NaN positions, an index out of range),
-// -ENOTSUP (format, or a glTF extension such as Draco), -EFBIG (> 2^26 triangles), -ENOMEM.
+// -ENOTSUP (format; a glTF extension such as Draco, or quantised attributes; UVs per face corner in PLY), -EFBIG (> 2^26
+// triangles), -ENOMEM.
 int mesh_read(struct mesh *out, struct mesh_check *check, const char *path);
 
 // Take over arrays made by code: fills normals where normal is NULL, point, chart, bounds. The mesh owns the arrays

@@ -6,9 +6,9 @@
 #include "solver/mesh.h"
 #include "solver/mesh_import.h"
 #include "solver/take/json.h"
+#include "solver/take/atomic_file.h"
 #include "solver/take/log.h"
 #include "solver/vec3.h"
-#include "solver/whole_file.h"
 
 #include <assimp/cfileio.h>
 #include <assimp/cimport.h>
@@ -851,9 +851,9 @@ struct importing {
 static int read_beside(struct opened *o, const char *path, const char *name)
 {
     char *full = path_beside(path, name);
-    const int err = full ? whole_file_read(&o->owned, &o->n_bytes, full, max_file_bytes) : -ENOMEM;
+    const int err = full ? file_read(&o->owned, &o->n_bytes, full, max_file_bytes) : -ENOMEM;
     if (err)
-        log_error("mesh: %s: cannot read its buffer %s: %s", path, name, strerror(-err));
+        log_error("mesh: %s: its buffer %s is needed: export the mesh again, or as one GLB", path, name);
     free(full);
     return err;
 }
@@ -1151,11 +1151,9 @@ int mesh_read(struct mesh *out, struct mesh_check *check, const char *path)
     struct soup s = { 0 };
     int format, n_dropped = 0;
     memset(out, 0, sizeof(*out));
-    int err = whole_file_read(&bytes, &f.n_bytes, path, max_file_bytes);
-    if (err) {
-        log_error("mesh: cannot read %s: %s", path, strerror(-err));
+    int err = file_read(&bytes, &f.n_bytes, path, max_file_bytes);
+    if (err)
         return err;
-    }
     f.bytes = bytes;
     err = mesh_check_file(&f, &format);
     if (!err)

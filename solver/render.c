@@ -776,7 +776,7 @@ static bool alike(const struct view_job *job, const struct point *p, const struc
         distance += pow((double)job->eye_m[i] - centre->surface.position_m[i], 2);
     }
     const double pixel_m = sqrt(distance) / fmin(job->camera->fx, job->camera->fy);
-    if (sqrt(away) > 3 * pixel_m || dot3f(p->surface.normal, centre->surface.normal) < .995f)
+    if (sqrt(away) > 3 * pixel_m || dot3f(p->surface.normal, centre->surface.normal) < .999f)
         return false;
     for (int k = 0; k < DISNEY_N; k++)
         if (fabsf(p->material.theta[k] - centre->material.theta[k]) > .005f)

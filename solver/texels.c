@@ -14,7 +14,7 @@
 enum { SIZE_MAX_TEXELS = 16384, OVERLAPPED = 1 << 30 };
 static const float uv_limit = 16; // corners further out: the triangle is left out; keeps edge functions below 2^62
 
-// Twice the size of a grid step is the unit in which texel centres are whole numbers: texel i has its centre at (2 i + 1) << half_bits.
+// A texel is 2 << half_bits grid steps wide; texel i has its centre at (2 i + 1) << half_bits.
 struct grid {
     int size, half_bits;
 };

@@ -2,7 +2,8 @@
 //
 // A texture has size x size texels; row 0 of an *image* is its top, v runs upwards, so texel (column i, image row j) has its
 // centre at u = (i + .5) / size, v = 1 - (j + .5) / size. A texel is covered when its centre lies in a triangle (a fixed rule
-// decides shared edges, so none is covered twice by neighbours). Covered texels are stored compactly, in image order.
+// decides shared edges, so none is covered twice by neighbours). Covered texels are stored compactly, in image order. What lies
+// outside [0,1] is clipped, not wrapped; a triangle with a corner further out than 16 is left out.
 #pragma once
 #include "solver/mesh.h"
 #include <stdint.h>
@@ -19,12 +20,13 @@ struct texels {
     uint32_t *pixel;        // [n] row * size + column
     float (*position_m)[3]; // [n]
     float (*normal)[3];     // [n] unit, interpolated
-    float (*tangent)[3];    // [n] unit, along +u, orthogonal to normal; bitangent = normal x tangent
+    float (*tangent)[3];    // [n] unit, along +u (area-weighted per vertex, then interpolated; d position / d u also where the
+                            // UVs are mirrored), orthogonal to normal; bitangent = normal x tangent
     float (*barycentric)[2]; // [n] weights of the triangle's second and third corner
     uint32_t *triangle;     // [n]
     int32_t *chart;         // [n]
     uint8_t *flags;         // [n]
-    float texel_size_m;     // sqrt(covered surface area / n): a typical texel's side
+    float texel_size_m;     // sqrt(textured surface area / texels it covers): a typical texel's side
 };
 
 // 1 <= size <= 16384. 0, -EINVAL (no texel covered: logged), -ENOMEM. The texels do not keep the mesh.

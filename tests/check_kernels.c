@@ -215,20 +215,27 @@ static void assert_small(const struct error *e, const char *kernel, const char *
                  rms, rms_bound);
 }
 
-enum function { SHADE, SHADE_JACOBIAN, BRUTE_JACOBIAN, IRRADIANCE, N_FUNCTIONS };
-static const char *const function_names[N_FUNCTIONS] = { "shade", "shade_jacobian", "brute_jacobian", "irradiance" };
+enum function { SHADE, SHADE_JACOBIAN, BRUTE_JACOBIAN, IRRADIANCE, VIEWS, N_FUNCTIONS };
+static const char *const function_names[N_FUNCTIONS] = { "shade", "shade_jacobian", "brute_jacobian", "irradiance",
+                                                           "shade_views" };
 
 static void add_scene(struct error errors[N_FUNCTIONS], const struct kernels *k, struct scene *s)
 {
     union {
         struct shade_jacobian j;
         float values[N_VALUES];
-    } shared, brute;
+    } shared, brute, views[3];
     float L[3], E[3];
     memset(&shared, 0xff, sizeof(shared)), memset(&brute, 0xff, sizeof(brute));
     k->gather(&s->lit, &s->lights, &s->surface, s->visible, s->soft);
     k->shade(L, &s->lit, &s->surface, s->v, &s->material);
     k->shade_jacobian(&shared.j, &s->lit, &s->surface, s->v, &s->material);
+    // The middle one of three views, the last of them below the horizon.
+    const float v3[3][3] = { { s->surface.normal[0], s->surface.normal[1], s->surface.normal[2] },
+                             { s->v[0], s->v[1], s->v[2] },
+                             { -s->v[0], -s->v[1], -s->v[2] } };
+    memset(views, 0xff, sizeof(views));
+    k->shade_jacobian_views(&views[0].j, 3, &s->lit, &s->surface, v3, &s->material);
     k->irradiance(E, &s->lights, &s->surface, s->visible);
     const bool whole = !s->visible && !s->soft; // brute force knows no visibility
     if (whole)
@@ -236,6 +243,8 @@ static void add_scene(struct error errors[N_FUNCTIONS], const struct kernels *k,
     for (int j = 0; j < N_VALUES; j++) {
         const double scale = fmax(s->arriving[channel_of(j)], s->scale);
         add_error(&errors[SHADE_JACOBIAN], (double)shared.values[j] - s->truth[j], scale);
+        add_error(&errors[VIEWS], (double)views[1].values[j] - s->truth[j], scale);
+        assert_true(views[2].values[j] == 0);
         if (whole)
             add_error(&errors[BRUTE_JACOBIAN], (double)brute.values[j] - s->truth[j], scale);
         if (j < 3)
@@ -467,6 +476,8 @@ static void times_are_printed(void **state)
                     kernels->shade_jacobian(&j, &s.lit, &s.surface, s.v, &s.material);
                 else if (f == BRUTE_JACOBIAN)
                     kernels->brute_jacobian(&j, &s.lights, &s.surface, s.v, &s.material);
+                else if (f == VIEWS)
+                    kernels->shade_jacobian_views(&j, 1, &s.lit, &s.surface, &s.v, &s.material);
                 else
                     kernels->irradiance(L, &s.lights, &s.surface, NULL);
             printf("# %-9s %-14s %.2f ns per sample and light\n", names[k], function_names[f], 1e9 * spent / (double)n);

@@ -4,7 +4,7 @@
 #include "solver/random.h"
 #include "solver/take/log.h"
 #include "solver/vec3.h"
-#include "solver/whole_file.h"
+#include "solver/take/atomic_file.h"
 
 #include <dirent.h>
 #include <errno.h>
@@ -288,6 +288,13 @@ static void points_behind_or_beyond_the_fold_are_not_seen(void **state)
     const double before[3] = { 1.9, 0, 1 }, after[3] = { 2.1, 0, 1 };
     assert_true(camera_project(&c, before, uv, NULL));
     assert_false(camera_project(&c, after, uv, NULL));
+    // r / (1 + .25 r^2) folds at r = 2
+    c.k[3] = .25;
+    assert_true(camera_project(&c, before, uv, NULL));
+    assert_false(camera_project(&c, after, uv, NULL));
+    // a focal length that no lens has: no ray, rather than one of no length
+    c = (struct camera){ .fx = 1e-250, .fy = 1, .cam_from_world = { 1, 0, 0, 0, 1, 0, 0, 0, 1 } };
+    assert_false(camera_ray(&c, beyond_image, d));
     // fisheye: 89 degrees off axis is fine, folds are not
     c = (struct camera){ .model = CAMERA_FISHEYE, .fx = 50, .fy = 50, .cam_from_world = { 1, 0, 0, 0, 1, 0, 0, 0, 1 } };
     const double wide[3] = { 0, sin(1.5533), cos(1.5533) };
@@ -356,7 +363,7 @@ static void what_colmap_cannot_hold_is_refused_by_view(void **state)
 
 #define HEAD_C "# Number of cameras: 2\n"
 #define CAM "7 PINHOLE 40 20 30 31 20 10\n3 SIMPLE_RADIAL 40 20 30 20 10 -.1\n"
-#define IMG "9 2 0 0 0 1 2 3 3 folder one/a b.c.jpg\n\n1 .5 .5 .5 .5 0 0 1 7 x.png\n1 2 -1 3.5 4e1 12\n"
+#define IMG "9 2 0 0 0 1 2 3 3 folder one/a b.c.jpg\n\n1 1 1 1 1 0 0 1 7 x.png\n1 2 -1 3.5 4e1 12\n"
 
 static void colmap_text_is_read_to_the_letter(void **state)
 {
@@ -374,8 +381,8 @@ static void colmap_text_is_read_to_the_letter(void **state)
     assert_int_equal(c.n, 2);
     assert_string_equal(c.view[0].name, "a b.c");
     assert_string_equal(c.view[1].name, "x");
-    const double R0[9] = { 1, 0, 0, 0, 1, 0, 0, 0, 1 }; // the quaternion is normalised
-    const double R1[9] = { 0, 0, 1, 1, 0, 0, 0, 1, 0 }; // Hamilton, world to camera
+    const double R0[9] = { 1, 0, 0, 0, 1, 0, 0, 0, 1 };
+    const double R1[9] = { 0, 0, 1, 1, 0, 0, 0, 1, 0 }; // Hamilton, world to camera, normalised
     assert_memory_equal(c.view[0].cam_from_world, R0, sizeof(R0));
     for (int i = 0; i < 9; i++)
         assert_true(fabs(c.view[1].cam_from_world[i] - R1[i]) < 1e-15);
@@ -384,6 +391,43 @@ static void colmap_text_is_read_to_the_letter(void **state)
     assert_true(c.view[0].centre_m[0] == -1 && c.view[0].centre_m[1] == -2 && c.view[0].centre_m[2] == -3);
     assert_true(fabs(c.view[1].centre_m[0]) < 1e-15 && fabs(c.view[1].centre_m[1] + 1) < 1e-15); // -R^T (0, 0, 1)
     cameras_free(&c);
+}
+
+// Which number is which, written out once more from COLMAP's documentation.
+static void each_parameter_goes_to_its_place(void **state)
+{
+    (void)state;
+    static const struct {
+        const char *line;
+        struct camera expected;
+    } cases[] = {
+        { "1 SIMPLE_PINHOLE 40 20 30 21 11\n", { .fx = 30, .fy = 30, .cx = 21, .cy = 11 } },
+        { "1 PINHOLE 40 20 30 31 21 11\n", { .fx = 30, .fy = 31, .cx = 21, .cy = 11 } },
+        { "1 SIMPLE_RADIAL 40 20 30 21 11 1\n", { .fx = 30, .fy = 30, .cx = 21, .cy = 11, .k = { 1 } } },
+        { "1 RADIAL 40 20 30 21 11 1 2\n", { .fx = 30, .fy = 30, .cx = 21, .cy = 11, .k = { 1, 2 } } },
+        { "1 OPENCV 40 20 30 31 21 11 1 2 3 4\n", { .fx = 30, .fy = 31, .cx = 21, .cy = 11, .k = { 1, 2 }, .p = { 3, 4 } } },
+        { "1 OPENCV_FISHEYE 40 20 30 31 21 11 1 2 3 4\n",
+          { .model = CAMERA_FISHEYE, .fx = 30, .fy = 31, .cx = 21, .cy = 11, .k = { 1, 2, 3, 4 } } },
+        { "1 FULL_OPENCV 40 20 30 31 21 11 1 2 3 4 5 6 7 8\n",
+          { .model = CAMERA_RATIONAL, .fx = 30, .fy = 31, .cx = 21, .cy = 11, .k = { 1, 2, 5, 6, 7, 8 }, .p = { 3, 4 } } },
+        { "1 SIMPLE_RADIAL_FISHEYE 40 20 30 21 11 1\n",
+          { .model = CAMERA_FISHEYE, .fx = 30, .fy = 30, .cx = 21, .cy = 11, .k = { 1 } } },
+        { "1 RADIAL_FISHEYE 40 20 30 21 11 1 2\n",
+          { .model = CAMERA_FISHEYE, .fx = 30, .fy = 30, .cx = 21, .cy = 11, .k = { 1, 2 } } },
+    };
+    for (size_t i = 0; i < sizeof(cases) / sizeof(cases[0]); i++) {
+        const char *images = "1 1 0 0 0 0 0 0 1 a.jpg\n\n";
+        const struct camera *e = &cases[i].expected;
+        struct cameras c;
+        assert_int_equal(cameras_parse_colmap_text(&c, cases[i].line, strlen(cases[i].line), "c", images, strlen(images), "i"), 0);
+        const struct camera *v = c.view;
+        assert_int_equal(v->model, e->model);
+        assert_true(v->fx == e->fx && v->fy == e->fy && v->cx == e->cx && v->cy == e->cy && v->skew == 0);
+        assert_memory_equal(v->k, e->k, sizeof(v->k));
+        assert_memory_equal(v->p, e->p, sizeof(v->p));
+        assert_true(v->width_px == 40 && v->height_px == 20);
+        cameras_free(&c);
+    }
 }
 
 static void broken_text_is_refused_with_its_line(void **state)
@@ -451,7 +495,7 @@ static void cut_files_never_give_other_cameras(void **state)
         struct cameras whole;
         assert_int_equal((binary ? cameras_write_colmap_binary : cameras_write_colmap_text)(&c, dir), 0);
         for (int k = 0; k < 2; k++)
-            assert_int_equal(whole_file_read(&bytes[k], &n[k], in_dir(names[binary][k]), 1 << 20), 0);
+            assert_int_equal(file_read(&bytes[k], &n[k], in_dir(names[binary][k]), 1 << 20), 0);
         assert_int_equal(cameras_read(&whole, dir), 0);
         for (int k = 0; k < 2; k++)
             for (size_t cut = 0; cut < n[k]; cut++) {
@@ -491,8 +535,8 @@ static void absurd_counts_are_refused_before_memory_is_asked_for(void **state)
     char *bytes[2] = { NULL, NULL };
     size_t n[2] = { 0, 0 };
     assert_int_equal(cameras_write_colmap_binary(&c, dir), 0);
-    assert_int_equal(whole_file_read(&bytes[0], &n[0], in_dir("cameras.bin"), 1 << 20), 0);
-    assert_int_equal(whole_file_read(&bytes[1], &n[1], in_dir("images.bin"), 1 << 20), 0);
+    assert_int_equal(file_read(&bytes[0], &n[0], in_dir("cameras.bin"), 1 << 20), 0);
+    assert_int_equal(file_read(&bytes[1], &n[1], in_dir("images.bin"), 1 << 20), 0);
     for (size_t i = 0; i < sizeof(counts) / sizeof(counts[0]); i++)
         for (int place = 0; place < 3; place++) { // cameras, images, points of the image
             char *copy[2] = { malloc(n[0]), malloc(n[1]) };
@@ -597,8 +641,8 @@ static void files_of_real_tools_are_read_or_refused(void **state)
             n_seen++;
         }
     }
-    fprintf(stderr, "test_cameras: COLMAP text against binary: %.3g px with 17 digits, %.3g px as shipped with 6 digits, %d points\n",
-            most, by_hand, n_seen);
+    fprintf(stderr, "test_cameras: COLMAP text against binary: %.3g px with 17 digits, %.3g px as shipped with 6 digits, "
+            "%d points\n", most, by_hand, n_seen);
     assert_int_equal(n_seen, 11000);
     assert_true(most < 1e-6);
     assert_true(by_hand < .1); // half a unit in the 6th digit of every number
@@ -633,6 +677,7 @@ int main(void)
         cmocka_unit_test(colmap_round_trip_keeps_every_distortion_model),
         cmocka_unit_test(what_colmap_cannot_hold_is_refused_by_view),
         cmocka_unit_test(colmap_text_is_read_to_the_letter),
+        cmocka_unit_test(each_parameter_goes_to_its_place),
         cmocka_unit_test(broken_text_is_refused_with_its_line),
         cmocka_unit_test(cut_files_never_give_other_cameras),
         cmocka_unit_test(absurd_counts_are_refused_before_memory_is_asked_for),

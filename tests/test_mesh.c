@@ -2,7 +2,7 @@
 #include "solver/mesh.h"
 #include "solver/take/log.h"
 #include "solver/vec3.h"
-#include "solver/whole_file.h"
+#include "solver/take/atomic_file.h"
 
 #include <dirent.h>
 #include <errno.h>
@@ -304,10 +304,11 @@ static void make_cube(struct mesh *m, bool broken_normals)
             uv[4 * face + k][0] = (float)((face % 3 + .1 + .8 * a) / 3);
             uv[4 * face + k][1] = (float)((face / 3 + .1 + .8 * b) / 2);
         }
+        const uint32_t from = face == 0 || face == 3; // which diagonal: uneven, so that corners have 3 to 6 triangles
         for (uint32_t k = 0; k < 2; k++) {
-            triangle[2 * face + (int)k][0] = 4 * (uint32_t)face;
-            triangle[2 * face + (int)k][1] = 4 * (uint32_t)face + 1 + k;
-            triangle[2 * face + (int)k][2] = 4 * (uint32_t)face + 2 + k;
+            triangle[2 * face + (int)k][0] = 4 * (uint32_t)face + from;
+            triangle[2 * face + (int)k][1] = 4 * (uint32_t)face + from + 1 + k;
+            triangle[2 * face + (int)k][2] = 4 * (uint32_t)face + (from + 2 + k) % 4;
         }
     }
     for (int i = 0; i < 24 && broken_normals; i++)
@@ -346,8 +347,8 @@ static void seams_are_no_creases(void **state)
 static void charts_join_where_edges_meet_in_space_and_atlas(void **state)
 {
     (void)state;
-    // Four triangles in a row. 0-1 share an edge and its UVs; 1-2 share the edge, but not the UVs; 2-3 the UVs (and normals differ),
-    // so that vertices are split and the chart is not.
+    // Four triangles in a row. 0-1 share an edge and its UVs; 1-2 share the edge, but not the UVs; 2-3 the UVs, but not the
+    // normals, so that vertices are split and the chart is not.
     const char *obj = "v 0 0 0\nv 1 0 0\nv 0 1 0\nv 1 1 0\nv 1 2 0\nv 0 2 0\n"
                       "vt 0 0\nvt .2 0\nvt 0 .2\nvt .2 .2\nvt .5 0\nvt .7 0\nvt .7 .2\nvt .5 .2\nvn 0 0 1\nvn 0 1 0\n"
                       "f 1/1 2/2 3/3\nf 2/2 4/4 3/3\nf 3/5/1 4/6/1 5/7/1\nf 3/5/2 5/7/2 6/8/2\n";
@@ -565,6 +566,8 @@ static void broken_glbs_are_refused_with_their_place(void **state)
     assert_int_equal(read_bytes(&m, NULL, "broken.glb", bytes, n), -EINVAL);
     assert_non_null(strstr(errors, "1 of 2 triangles use vertices that do not exist"));
     make_glb(bytes, GLTF(ONE_NODE, "", ""));
+    assert_int_equal(read_bytes(&m, NULL, "broken.glb", bytes, n + 4), -EINVAL);
+    assert_non_null(strstr(errors, "the header says"));
     bytes[4] = 1;
     assert_int_equal(read_bytes(&m, NULL, "broken.glb", bytes, n), -ENOTSUP);
     assert_non_null(strstr(errors, "version 1"));

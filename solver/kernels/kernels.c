@@ -71,8 +71,8 @@ int lit_new(struct lit *out, int n_lights)
     // One vector more than the lights: compaction stores whole vectors.
     struct lit l = { .capacity = padded(n_lights) + KERNEL_WIDTH };
     float **const arrays[] = { &l.lx, &l.ly, &l.nl, &l.sl, &l.gc, &l.wr, &l.wg, &l.wb,
-                               &l.lx_rest, &l.ly_rest };
-    const int err = new_arrays(arrays, 10, l.capacity);
+                               &l.lx_rest, &l.ly_rest, &l.g, &l.g_r, &l.g_a };
+    const int err = new_arrays(arrays, 13, l.capacity);
     if (err)
         return err;
     *out = l;

@@ -32,6 +32,7 @@ struct lit {
     int n, capacity;
     float *lx, *ly, *nl, *sl /* S(nl) = (1-nl)^5 */, *gc /* clearcoat's g1(nl, .25) */, *wr, *wg, *wb;
     float *lx_rest, *ly_rest; // what float left of lx, ly: sharp lobes need it
+    float *g, *g_r, *g_a;     // scratch of shade_jacobian_views
 };
 int lit_new(struct lit *out, int n_lights); // 0 or -ENOMEM
 void lit_free(struct lit *l);
@@ -63,6 +64,9 @@ struct kernels {
     // Lambert: irradiance E = sum V_i <n,l_i> c_i, without albedo / pi, in one pass over the lights.
     void (*irradiance)(float E[3], const struct light_arrays *lights, const struct surface_point *s,
                        const uint16_t *visible);
+    // shade_jacobian for all views of a texel, sharing what depends on light and material. Writes the scratch arrays of lit.
+    void (*shade_jacobian_views)(struct shade_jacobian *out, int n_views, struct lit *lit, const struct surface_point *s,
+                                 const float (*v)[3], const struct shade_material *m);
 };
 
 enum { KERNELS_REFERENCE = 1, KERNELS_PORTABLE = 2, KERNELS_AVX2 = 4, KERNELS_AVX512 = 8, KERNELS_ALL = 15 };

@@ -120,7 +120,7 @@ V void add_up(const vf *x, int n, float *sums)
 #include "solver/kernels/kernels_body.h"
 
 static const struct kernels table = {
-    "avx2", gather, shade, shade_jacobian, brute_jacobian, irradiance,
+    "avx2", gather, shade, shade_jacobian, brute_jacobian, irradiance, shade_jacobian_views,
 };
 const struct kernels *const kernels_avx2_table = &table;
 #else

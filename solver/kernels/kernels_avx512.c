@@ -121,7 +121,7 @@ V void add_up(const vf *x, int n, float *sums)
 #include "solver/kernels/kernels_body.h"
 
 static const struct kernels table = {
-    "avx512", gather, shade, shade_jacobian, brute_jacobian, irradiance,
+    "avx512", gather, shade, shade_jacobian, brute_jacobian, irradiance, shade_jacobian_views,
 };
 const struct kernels *const kernels_avx512_table = &table;
 #else

@@ -1,7 +1,7 @@
 // solver/kernels/kernels_body.h - the float kernels, written once over a vector type; each instruction set's file defines
 //   vf, LANES floats (LANES divides KERNEL_WIDTH), and vd, half as many doubles;
-//   v_set1 v_load v_store v_max v_fma(a,b,c) = ab+c, v_fnma = c-ab, v_rcp, v_rsqrt_sqrt (returns 1/sqrt, stores sqrt);
-//   v_mask: v_positive(x, bits) v_count v_compress; v_keep v_bytes add_up; d_set1 d_fma d_fnma d_wide(x, half) d_narrow(a, b)
+//   v_set1 v_load v_store v_max v_fma(a,b,c) = ab+c, v_rcp, v_rsqrt_sqrt (returns 1/sqrt, stores sqrt);
+//   v_mask: v_positive(x, bits) v_count v_compress; v_keep v_bytes add_up; d_set1 d_fma d_fnma(a,b,c) = c-ab d_wide(x, half) d_narrow(a, b)
 // and includes this file.
 //
 // Light and view directions are in the surface's own frame (x, y, n), where the horizon is a sign and alpha is diagonal.
@@ -22,9 +22,16 @@
 #include <math.h>
 
 enum { BLOCK = 1024 };
-#define SHARP .1f
+#define SHARP .07f
 enum { FD, SS, FH, GDN, GDF, COAT, BY_ROUGHNESS, BY_ANISOTROPIC, BY_GLOSS, N_SUMS };
 #define INLINE static inline __attribute__((always_inline))
+
+typedef float v4 __attribute__((vector_size(16))); // three channels and one idle lane
+
+static v4 all4(float x)
+{
+    return (v4){ x, x, x, x };
+}
 
 struct constants {
     float vx, vy, nv, sv;           // view in the surface's frame, S(nv)
@@ -38,12 +45,12 @@ struct constants {
     float gloss0, gloss1;           // d ln(Dc)/d gloss = gloss0 + gloss1 nh^2/(...)
     float by_fd, by_ss;             // roughness derivative of the base: |s|^2 (by_fd dFd + by_ss k dFss)
     float scale_gd, scale_coat;     // what D, G and coat have in common for all lights
-    float f0[3], kd[3];             // F0; (1-metallic) C / pi / scale_gd
+    v4 f0, kd;                      // F0; (1-metallic) C / pi / scale_gd
     float subsurface;
-};
-
-struct material_terms { // per call, for turning the sums into L and its derivatives
-    float tint[3], lum, sheen_colour[3], f0_dielectric[3], specular_colour[3];
+    // From the material alone, for the above and for turning the sums into L and its derivatives:
+    float r0_material, a0_material, scale_d, scale_dc;
+    float lum;
+    v4 albedo, tint, sheen_colour, f0_dielectric, specular_colour;
 };
 
 static float dot3(const float a[3], const float b[3])
@@ -65,17 +72,8 @@ static float pow5(float x)
     return x * x * (x * x) * x;
 }
 
-// False below the horizon.
-static bool find_constants(struct constants *k, struct material_terms *t, const struct surface_point *s,
-                           const float v[3], const struct shade_material *m)
+static void find_material(struct constants *k, const struct shade_material *m)
 {
-    const float nv = dot3(s->normal, v);
-    if (!(nv > 0))
-        return false;
-    k->nv = nv > 1e-10f ? nv : 1e-10f; // keeps |s|^2 and 1/(nl+nv) within float's range
-    k->vx = split(s->tangent, v, &k->vx_rest), k->vy = split(s->bitangent, v, &k->vy_rest);
-    k->sv = pow5(nv < 1 ? 1 - nv : 0);
-
     const float *theta = m->theta;
     const float r = theta[DISNEY_ROUGHNESS], metallic = theta[DISNEY_METALLIC];
     const float subsurface = theta[DISNEY_SUBSURFACE];
@@ -102,33 +100,42 @@ static bool find_constants(struct constants *k, struct material_terms *t, const 
         k->gr_x = ax * ax_r, k->gr_y = ay * ay_r;
         k->ga_x = ax * ax_an, k->ga_y = ay * ay_an;
     }
-    const float vx2 = k->vx * k->vx, vy2 = k->vy * k->vy;
-    const float root = sqrtf(vx2 * k->gx2 + vy2 * k->gy2 + k->nv * k->nv), gv = 1 / (k->nv + root);
-    k->r0 = -(iax * ax_r + iay * ay_r) - gv / root * (vx2 * k->gr_x + vy2 * k->gr_y);
-    k->a0 = -(iax * ax_an + iay * ay_an) - gv / root * (vx2 * k->ga_x + vy2 * k->ga_y);
-    k->scale_gd = gv * iax * iay * (float)M_1_PI;
+    k->r0_material = -(iax * ax_r + iay * ay_r), k->a0_material = -(iax * ax_an + iay * ay_an);
+    k->scale_d = iax * iay * (float)M_1_PI;
 
     const float a = .001f + .099f * (1 - theta[DISNEY_CLEARCOAT_GLOSS]), a2 = a * a, log_a2 = logf(a2);
-    const float coat_root = sqrtf(.0625f + .9375f * k->nv * k->nv);
     k->a2 = a2;
-    k->scale_coat = .25f * (a2 - 1) / ((float)M_PI * log_a2 * (k->nv + coat_root));
+    k->scale_dc = .25f * (a2 - 1) / ((float)M_PI * log_a2);
     k->gloss0 = -.099f * (2 * a / (a2 - 1) - 2 / (a * log_a2)), k->gloss1 = .198f * a;
 
     k->r4 = .25f * r;
     k->subsurface = subsurface;
     k->by_fd = (1 - subsurface) * .5f, k->by_ss = subsurface * 1.25f * .25f;
-    const float lum = .3f * m->albedo[0] + .6f * m->albedo[1] + .1f * m->albedo[2];
-    t->lum = lum;
-    const float base = (1 - metallic) * (float)M_1_PI / k->scale_gd;
-    for (int c = 0; c < 3; c++) {
-        const float tint = lum > 0 ? m->albedo[c] / lum : 1;
-        t->tint[c] = tint;
-        t->sheen_colour[c] = 1 + theta[DISNEY_SHEEN_TINT] * (tint - 1);
-        t->specular_colour[c] = .08f * (1 + theta[DISNEY_SPECULAR_TINT] * (tint - 1));
-        t->f0_dielectric[c] = theta[DISNEY_SPECULAR] * t->specular_colour[c];
-        k->f0[c] = t->f0_dielectric[c] + metallic * (m->albedo[c] - t->f0_dielectric[c]);
-        k->kd[c] = base * m->albedo[c];
-    }
+    k->lum = .3f * m->albedo[0] + .6f * m->albedo[1] + .1f * m->albedo[2];
+    k->albedo = (v4){ m->albedo[0], m->albedo[1], m->albedo[2], 0 };
+    k->tint = k->lum > 0 ? k->albedo / k->lum : all4(1);
+    k->sheen_colour = 1 + theta[DISNEY_SHEEN_TINT] * (k->tint - 1);
+    k->specular_colour = .08f * (1 + theta[DISNEY_SPECULAR_TINT] * (k->tint - 1));
+    k->f0_dielectric = theta[DISNEY_SPECULAR] * k->specular_colour;
+    k->f0 = k->f0_dielectric + metallic * (k->albedo - k->f0_dielectric);
+}
+
+// False below the horizon.
+static bool find_view(struct constants *k, const struct surface_point *s, const float v[3], const struct shade_material *m)
+{
+    const float nv = dot3(s->normal, v);
+    if (!(nv > 0))
+        return false;
+    k->nv = nv > 1e-10f ? nv : 1e-10f; // keeps |s|^2 and 1/(nl+nv) within float's range
+    k->vx = split(s->tangent, v, &k->vx_rest), k->vy = split(s->bitangent, v, &k->vy_rest);
+    k->sv = pow5(nv < 1 ? 1 - nv : 0);
+    const float vx2 = k->vx * k->vx, vy2 = k->vy * k->vy;
+    const float root = sqrtf(vx2 * k->gx2 + vy2 * k->gy2 + k->nv * k->nv), gv = 1 / (k->nv + root), gi = gv / root;
+    k->r0 = k->r0_material - gi * (vx2 * k->gr_x + vy2 * k->gr_y);
+    k->a0 = k->a0_material - gi * (vx2 * k->ga_x + vy2 * k->ga_y);
+    k->scale_gd = gv * k->scale_d;
+    k->scale_coat = k->scale_dc / (k->nv + sqrtf(.0625f + .9375f * k->nv * k->nv));
+    k->kd = (1 - m->theta[DISNEY_METALLIC]) * (float)M_1_PI / k->scale_gd * k->albedo;
     return true;
 }
 
@@ -136,6 +143,7 @@ static bool find_constants(struct constants *k, struct material_terms *t, const 
 struct light_vector {
     vf lx, ly, nl, sl, gc, w[3]; // sl = S(nl); gc = clearcoat's g1(nl, .25); w = V nl c per channel
     vf lx_rest, ly_rest;         // when sharp
+    vf g, g_r, g_a;              // G's part of the light, - d ln g by roughness and by anisotropic
 };
 
 INLINE vf v_schlick(vf u)
@@ -197,6 +205,17 @@ INLINE void shade_light(vf sum[3], const struct constants *k, const struct light
     }
 }
 
+INLINE void mask_light(struct light_vector *l, const struct constants *k)
+{
+    const vf lx2 = l->lx * l->lx, ly2 = l->ly * l->ly;
+    vf root;
+    const vf iroot = v_rsqrt_sqrt(v_fma(l->nl, l->nl, v_fma(lx2, v_set1(k->gx2), ly2 * v_set1(k->gy2))), &root);
+    l->g = v_rcp(l->nl + root);
+    const vf gi = l->g * iroot;
+    l->g_r = gi * v_fma(lx2, v_set1(k->gr_x), ly2 * v_set1(k->gr_y));
+    l->g_a = gi * v_fma(lx2, v_set1(k->ga_x), ly2 * v_set1(k->ga_y));
+}
+
 INLINE void jacobian_light(vf sum[N_SUMS][3], const struct constants *k, const struct light_vector *l, bool sharp)
 {
     const vf one = v_set1(1);
@@ -220,16 +239,10 @@ INLINE void jacobian_light(vf sum[N_SUMS][3], const struct constants *k, const s
     const vf base_r = s2 * v_fma(d_fd, v_set1(k->by_fd), d_ss * k_ss * v_set1(k->by_ss));
 
     const vf ip = v_rcp(v_fma(x2, v_set1(k->ix2), v_fma(y2, v_set1(k->iy2), z2))), d = s2 * ip;
-    const vf lx2 = l->lx * l->lx, ly2 = l->ly * l->ly;
-    vf root;
-    const vf iroot = v_rsqrt_sqrt(v_fma(l->nl, l->nl, v_fma(lx2, v_set1(k->gx2), ly2 * v_set1(k->gy2))), &root);
-    const vf g = v_rcp(l->nl + root), gi = g * iroot;
-    const vf gd = d * d * g;
-    const vf gr = v_fma(lx2, v_set1(k->gr_x), ly2 * v_set1(k->gr_y));
-    const vf ga = v_fma(lx2, v_set1(k->ga_x), ly2 * v_set1(k->ga_y));
+    const vf gd = d * d * l->g;
     const vf dr = v_fma(x2, v_set1(k->rx), y2 * v_set1(k->ry)), da = v_fma(x2, v_set1(k->ax), y2 * v_set1(k->ay));
-    const vf gd_r = gd * v_fnma(gi, gr, v_fma(ip, dr, v_set1(k->r0)));
-    const vf gd_a = gd * v_fnma(gi, ga, v_fma(ip, da, v_set1(k->a0)));
+    const vf gd_r = gd * (v_fma(ip, dr, v_set1(k->r0)) - l->g_r);
+    const vf gd_a = gd * (v_fma(ip, da, v_set1(k->a0)) - l->g_a);
     term[GDF] = gd * term[FH];
     term[GDN] = gd - term[GDF];
 
@@ -246,37 +259,50 @@ INLINE void jacobian_light(vf sum[N_SUMS][3], const struct constants *k, const s
     }
 }
 
-static void finish(struct shade_jacobian *out, float sums[N_SUMS][3], const struct constants *k,
-                   const struct material_terms *t, const struct shade_material *m)
+// One more float than sums, as channels are read four at a time.
+struct sums {
+    float of[N_SUMS * 3 + 1];
+};
+
+static v4 channels(const struct sums *sums, int i)
 {
-    const float *theta = m->theta, weight[3] = { .3f, .6f, .1f };
-    const float metallic = theta[DISNEY_METALLIC], dielectric = 1 - metallic;
+    const float *of = sums->of + 3 * i;
+    return (v4){ of[0], of[1], of[2], of[3] };
+}
+
+static void finish(struct shade_jacobian *out, const struct sums *sums, const struct constants *k,
+                   const struct shade_material *m)
+{
+    const float *theta = m->theta, metallic = theta[DISNEY_METALLIC], dielectric = 1 - metallic;
     const float specular = theta[DISNEY_SPECULAR], specular_tint = theta[DISNEY_SPECULAR_TINT];
     const float sheen = theta[DISNEY_SHEEN], sheen_tint = theta[DISNEY_SHEEN_TINT];
-    const float clearcoat = theta[DISNEY_CLEARCOAT], ilum = t->lum > 0 ? 1 / t->lum : 0;
+    const float clearcoat = theta[DISNEY_CLEARCOAT], ilum = k->lum > 0 ? 1 / k->lum : 0;
+    const v4 fd = channels(sums, FD) * (float)M_1_PI, ss = channels(sums, SS) * (float)M_1_PI, fh = channels(sums, FH);
+    const v4 gdn = k->scale_gd * channels(sums, GDN), gdf = k->scale_gd * channels(sums, GDF);
+    const v4 coat = k->scale_coat * channels(sums, COAT), gloss = k->scale_coat * channels(sums, BY_GLOSS);
+    const v4 base = fd + theta[DISNEY_SUBSURFACE] * (ss - fd), diffuse = k->albedo * base + fh * sheen * k->sheen_colour;
+    const v4 L = dielectric * diffuse + k->f0 * gdn + gdf + clearcoat * coat, off_grey = k->tint - 1;
+    v4 d[DISNEY_N];
+    d[DISNEY_METALLIC] = gdn * (k->albedo - k->f0_dielectric) - diffuse;
+    d[DISNEY_SUBSURFACE] = dielectric * k->albedo * (ss - fd);
+    d[DISNEY_SPECULAR] = dielectric * gdn * k->specular_colour;
+    d[DISNEY_ROUGHNESS] = k->scale_gd * channels(sums, BY_ROUGHNESS);
+    d[DISNEY_SPECULAR_TINT] = dielectric * .08f * specular * gdn * off_grey;
+    d[DISNEY_ANISOTROPIC] = k->scale_gd * channels(sums, BY_ANISOTROPIC);
+    d[DISNEY_SHEEN] = dielectric * fh * k->sheen_colour;
+    d[DISNEY_SHEEN_TINT] = dielectric * sheen * fh * off_grey;
+    d[DISNEY_CLEARCOAT] = coat;
+    d[DISNEY_CLEARCOAT_GLOSS] = clearcoat * gloss;
+    const v4 by_tint = dielectric * ilum * (sheen * sheen_tint * fh + .08f * specular * specular_tint * gdn);
+    const v4 by_self = dielectric * base + metallic * gdn + by_tint, weight = { .3f, .6f, .1f, 0 };
     for (int c = 0; c < 3; c++) {
-        const float fd = sums[FD][c] * (float)M_1_PI, ss = sums[SS][c] * (float)M_1_PI;
-        const float fh = sums[FH][c];
-        const float gdn = k->scale_gd * sums[GDN][c], gdf = k->scale_gd * sums[GDF][c];
-        const float coat = k->scale_coat * sums[COAT][c], gloss = k->scale_coat * sums[BY_GLOSS][c];
-        const float base = fd + theta[DISNEY_SUBSURFACE] * (ss - fd), albedo = m->albedo[c], tint = t->tint[c];
-        const float diffuse = albedo * base + fh * sheen * t->sheen_colour[c];
-        out->L[c] = dielectric * diffuse + k->f0[c] * gdn + gdf + clearcoat * coat;
-        float *d = out->theta[c];
-        d[DISNEY_METALLIC] = gdn * (albedo - t->f0_dielectric[c]) - diffuse;
-        d[DISNEY_SUBSURFACE] = dielectric * albedo * (ss - fd);
-        d[DISNEY_SPECULAR] = dielectric * gdn * t->specular_colour[c];
-        d[DISNEY_ROUGHNESS] = k->scale_gd * sums[BY_ROUGHNESS][c];
-        d[DISNEY_SPECULAR_TINT] = dielectric * gdn * .08f * specular * (tint - 1);
-        d[DISNEY_ANISOTROPIC] = k->scale_gd * sums[BY_ANISOTROPIC][c];
-        d[DISNEY_SHEEN] = dielectric * fh * t->sheen_colour[c];
-        d[DISNEY_SHEEN_TINT] = dielectric * fh * sheen * (tint - 1);
-        d[DISNEY_CLEARCOAT] = coat;
-        d[DISNEY_CLEARCOAT_GLOSS] = clearcoat * gloss;
-        const float by_tint = dielectric * (fh * sheen * sheen_tint + gdn * .08f * specular * specular_tint) * ilum;
-        const float by_self = dielectric * base + metallic * gdn;
+        out->L[c] = L[c];
+        for (int i = 0; i < DISNEY_N; i++)
+            out->theta[c][i] = d[i][c];
+        const v4 row = by_tint[c] * -k->tint[c] * weight;
         for (int j = 0; j < 3; j++)
-            out->albedo[c][j] = by_tint * ((c == j) - tint * weight[j]) + (c == j ? by_self : 0);
+            out->albedo[c][j] = row[j];
+        out->albedo[c][c] += by_self[c];
     }
 }
 
@@ -295,7 +321,8 @@ INLINE void load_lit(struct light_vector *l, const struct lit *lit, int i, bool 
         l->lx_rest = v_load(lit->lx_rest + i), l->ly_rest = v_load(lit->ly_rest + i);
 }
 
-INLINE void jacobian_all(float sums[N_SUMS][3], const struct lit *lit, const struct constants *k, bool sharp)
+// masked: mask_light's results lie in lit.
+INLINE void jacobian_all(struct sums *sums, const struct lit *lit, const struct constants *k, bool sharp, bool masked)
 {
     for (int begin = 0; begin < lit->n; begin += BLOCK) {
         const int end = lit->n - begin < BLOCK ? lit->n : begin + BLOCK;
@@ -304,9 +331,13 @@ INLINE void jacobian_all(float sums[N_SUMS][3], const struct lit *lit, const str
         for (int i = begin; i < end; i += LANES) {
             struct light_vector l;
             load_lit(&l, lit, i, sharp);
+            if (masked)
+                l.g = v_load(lit->g + i), l.g_r = v_load(lit->g_r + i), l.g_a = v_load(lit->g_a + i);
+            else
+                mask_light(&l, k);
             jacobian_light(sum, k, &l, sharp);
         }
-        add_up(&sum[0][0], N_SUMS * 3, &sums[0][0]);
+        add_up(&sum[0][0], N_SUMS * 3, sums->of);
     }
 }
 
@@ -314,16 +345,41 @@ static void shade_jacobian(struct shade_jacobian *out, const struct lit *lit, co
                            const float v[3], const struct shade_material *m)
 {
     struct constants k;
-    struct material_terms t;
+    struct sums sums = { 0 };
     *out = (struct shade_jacobian){ 0 };
-    if (!find_constants(&k, &t, s, v, m))
+    find_material(&k, m);
+    if (!find_view(&k, s, v, m))
         return;
-    float sums[N_SUMS][3] = { 0 };
     if (k.sharp)
-        jacobian_all(sums, lit, &k, true);
+        jacobian_all(&sums, lit, &k, true, false);
     else
-        jacobian_all(sums, lit, &k, false);
-    finish(out, sums, &k, &t, m);
+        jacobian_all(&sums, lit, &k, false, false);
+    finish(out, &sums, &k, m);
+}
+
+static void shade_jacobian_views(struct shade_jacobian *out, int n_views, struct lit *lit, const struct surface_point *s,
+                                 const float (*v)[3], const struct shade_material *m)
+{
+    struct constants k;
+    find_material(&k, m);
+    for (int i = 0; i < lit->n; i += LANES) {
+        struct light_vector l;
+        load_lit(&l, lit, i, false);
+        mask_light(&l, &k);
+        v_store(lit->g + i, l.g), v_store(lit->g_r + i, l.g_r), v_store(lit->g_a + i, l.g_a);
+    }
+    for (int i = 0; i < n_views; i++) {
+        struct sums sums = { 0 };
+        if (!find_view(&k, s, v[i], m)) {
+            out[i] = (struct shade_jacobian){ 0 };
+            continue;
+        }
+        if (k.sharp)
+            jacobian_all(&sums, lit, &k, true, true);
+        else
+            jacobian_all(&sums, lit, &k, false, true);
+        finish(&out[i], &sums, &k, m);
+    }
 }
 
 INLINE void shade_all(float L[3], const struct lit *lit, const struct constants *k, bool sharp, const float base[3],
@@ -345,15 +401,15 @@ static void shade(float L[3], const struct lit *lit, const struct surface_point 
                   const struct shade_material *m)
 {
     struct constants k;
-    struct material_terms t;
     L[0] = L[1] = L[2] = 0;
-    if (!find_constants(&k, &t, s, v, m))
+    find_material(&k, m);
+    if (!find_view(&k, s, v, m))
         return;
     const float dielectric = 1 - m->theta[DISNEY_METALLIC];
     float base[3], sheen[3];
     for (int c = 0; c < 3; c++) {
         base[c] = dielectric * m->albedo[c] * (float)M_1_PI;
-        sheen[c] = dielectric * m->theta[DISNEY_SHEEN] * t.sheen_colour[c];
+        sheen[c] = dielectric * m->theta[DISNEY_SHEEN] * k.sheen_colour[c];
     }
     k.scale_coat *= m->theta[DISNEY_CLEARCOAT];
     const bool subsurface = m->theta[DISNEY_SUBSURFACE] > 0 && dielectric > 0, coat = m->theta[DISNEY_CLEARCOAT] > 0;
@@ -377,62 +433,49 @@ struct incoming {
     vf lx, ly, nl, weight, lx_rest, ly_rest;
 };
 
-// nl stays above 0 so that nothing divides by 0, whatever the weight.
-INLINE void weigh(struct incoming *in, vf ud, vf iu)
+INLINE vf v_dot(const vf u[3], const float a[3])
 {
-    in->weight = v_max(in->nl, v_set1(0)) * v_max(ud, v_set1(0)) * (iu * iu * iu);
-    in->nl = v_max(in->nl, v_set1(1e-10f));
+    return v_fma(u[0], v_set1(a[0]), v_fma(u[1], v_set1(a[1]), u[2] * v_set1(a[2])));
 }
 
-INLINE struct incoming light_at(const struct light_arrays *a, int i, const struct surface_point *s)
+INLINE vd d_dot(const vd u[3], const float a[3])
 {
-    const vf q = v_load(a->q + i);
-    vf d[3], u[3];
-    for (int c = 0; c < 3; c++) {
-        d[c] = v_load((c == 0 ? a->dx : c == 1 ? a->dy : a->dz) + i);
-        u[c] = v_fma(q, v_set1(a->centre_m[c] - s->position_m[c]), d[c]);
-    }
-    vf unused;
-    const vf iu = v_rsqrt_sqrt(v_max(v_fma(u[0], u[0], v_fma(u[1], u[1], u[2] * u[2])), v_set1(1e-12f)), &unused);
-    const float *const x = s->tangent, *const y = s->bitangent, *const n = s->normal;
+    return d_fma(u[0], d_set1((double)a[0]), d_fma(u[1], d_set1((double)a[1]), u[2] * d_set1((double)a[2])));
+}
+
+// exact: lx and ly in double, half a vector at a time, kept as float + float.
+INLINE struct incoming light_at(const struct light_arrays *a, int i, const struct surface_point *s, bool exact)
+{
     struct incoming in;
-    in.lx = iu * v_fma(u[0], v_set1(x[0]), v_fma(u[1], v_set1(x[1]), u[2] * v_set1(x[2])));
-    in.ly = iu * v_fma(u[0], v_set1(y[0]), v_fma(u[1], v_set1(y[1]), u[2] * v_set1(y[2])));
-    in.nl = iu * v_fma(u[0], v_set1(n[0]), v_fma(u[1], v_set1(n[1]), u[2] * v_set1(n[2])));
-    weigh(&in, v_fma(u[0], d[0], v_fma(u[1], d[1], u[2] * d[2])), iu);
-    return in;
-}
-
-// The same in double, half a vector at a time.
-INLINE struct incoming light_at_exact(const struct light_arrays *a, int i, const struct surface_point *s)
-{
-    vd lx[2], ly[2], nl[2], ud[2], iu[2];
-    for (int half = 0; half < 2; half++) {
-        const vd q = d_wide(v_load(a->q + i), half);
-        vd d[3], u[3];
-        for (int c = 0; c < 3; c++) {
-            d[c] = d_wide(v_load((c == 0 ? a->dx : c == 1 ? a->dy : a->dz) + i), half);
-            u[c] = d_fma(q, d_set1((double)a->centre_m[c] - (double)s->position_m[c]), d[c]);
+    const vf q = v_load(a->q + i), d[3] = { v_load(a->dx + i), v_load(a->dy + i), v_load(a->dz + i) };
+    vf u[3], unused;
+    for (int c = 0; c < 3; c++)
+        u[c] = v_fma(q, v_set1(a->centre_m[c] - s->position_m[c]), d[c]);
+    const vf u2 = v_max(v_fma(u[0], u[0], v_fma(u[1], u[1], u[2] * u[2])), v_set1(1e-12f));
+    const vf ud = v_max(v_fma(u[0], d[0], v_fma(u[1], d[1], u[2] * d[2])), v_set1(0));
+    const vf iu = v_rsqrt_sqrt(u2, &unused);
+    if (exact) {
+        vd lx[2], ly[2];
+        for (int half = 0; half < 2; half++) {
+            const vd q_half = d_wide(q, half), y = d_wide(iu, half);
+            vd w[3];
+            for (int c = 0; c < 3; c++)
+                w[c] = d_fma(q_half, d_set1((double)a->centre_m[c] - (double)s->position_m[c]), d_wide(d[c], half));
+            const vd w2 = d_fma(w[0], w[0], d_fma(w[1], w[1], w[2] * w[2]));
+            // One Newton step takes 1e-7 to 1e-14.
+            const vd iw = d_fma(y * d_set1(.5), d_fnma(w2 * y, y, d_set1(1)), y);
+            lx[half] = iw * d_dot(w, s->tangent), ly[half] = iw * d_dot(w, s->bitangent);
         }
-        const vd u2 = d_fma(u[0], u[0], d_fma(u[1], u[1], u[2] * u[2]));
-        ud[half] = d_fma(u[0], d[0], d_fma(u[1], d[1], u[2] * d[2]));
-        iu[half] = u2;
-        const float *const x = s->tangent, *const y = s->bitangent, *const n = s->normal;
-        lx[half] = d_fma(u[0], d_set1((double)x[0]), d_fma(u[1], d_set1((double)x[1]), u[2] * d_set1((double)x[2])));
-        ly[half] = d_fma(u[0], d_set1((double)y[0]), d_fma(u[1], d_set1((double)y[1]), u[2] * d_set1((double)y[2])));
-        nl[half] = d_fma(u[0], d_set1((double)n[0]), d_fma(u[1], d_set1((double)n[1]), u[2] * d_set1((double)n[2])));
+        in.lx = d_narrow(lx[0], lx[1]), in.ly = d_narrow(ly[0], ly[1]);
+        in.lx_rest = d_narrow(lx[0] - d_wide(in.lx, 0), lx[1] - d_wide(in.lx, 1));
+        in.ly_rest = d_narrow(ly[0] - d_wide(in.ly, 0), ly[1] - d_wide(in.ly, 1));
+    } else {
+        in.lx = iu * v_dot(u, s->tangent), in.ly = iu * v_dot(u, s->bitangent);
+        in.lx_rest = in.ly_rest = v_set1(0);
     }
-    vf unused;
-    const vf start = v_rsqrt_sqrt(v_max(d_narrow(iu[0], iu[1]), v_set1(1e-12f)), &unused);
-    for (int half = 0; half < 2; half++) { // one Newton step takes 1e-7 to 1e-14
-        const vd y = d_wide(start, half), e = d_fnma(iu[half] * y, y, d_set1(1));
-        iu[half] = d_fma(y * d_set1(.5), e, y);
-        lx[half] *= iu[half], ly[half] *= iu[half], nl[half] *= iu[half];
-    }
-    struct incoming in = { .lx = d_narrow(lx[0], lx[1]), .ly = d_narrow(ly[0], ly[1]), .nl = d_narrow(nl[0], nl[1]) };
-    in.lx_rest = d_narrow(lx[0] - d_wide(in.lx, 0), lx[1] - d_wide(in.lx, 1));
-    in.ly_rest = d_narrow(ly[0] - d_wide(in.ly, 0), ly[1] - d_wide(in.ly, 1));
-    weigh(&in, d_narrow(ud[0], ud[1]), d_narrow(iu[0], iu[1]));
+    const vf nl = iu * v_dot(u, s->normal);
+    in.weight = v_max(nl, v_set1(0)) * ud * (iu * iu * iu);
+    in.nl = v_max(nl, v_set1(1e-10f)); // so that nothing divides by 0, whatever the weight
     return in;
 }
 
@@ -446,7 +489,7 @@ static void gather(struct lit *out, const struct light_arrays *a, const struct s
 {
     int n = 0;
     for (int i = 0; i < a->n_padded; i += LANES) {
-        struct incoming in = light_at_exact(a, i, s);
+        struct incoming in = light_at(a, i, s, true);
         if (soft)
             in.weight = in.weight * v_bytes(soft + i, a->n - i) * v_set1(1 / 255.f);
         // weight > 0 holds for lights above the horizon that face the point, and for no padding.
@@ -472,7 +515,7 @@ static void gather(struct lit *out, const struct light_arrays *a, const struct s
     }
 }
 
-INLINE void brute_all(float sums[N_SUMS][3], const struct light_arrays *a, const struct surface_point *s,
+INLINE void brute_all(struct sums *sums, const struct light_arrays *a, const struct surface_point *s,
                       const struct constants *k, bool sharp)
 {
     for (int begin = 0; begin < a->n_padded; begin += BLOCK) {
@@ -480,16 +523,15 @@ INLINE void brute_all(float sums[N_SUMS][3], const struct light_arrays *a, const
         vf sum[N_SUMS][3];
         clear_sums(sum);
         for (int i = begin; i < end; i += LANES) {
-            const struct incoming in = sharp ? light_at_exact(a, i, s) : light_at(a, i, s);
-            struct light_vector l = { .lx = in.lx, .ly = in.ly, .nl = in.nl };
-            if (sharp)
-                l.lx_rest = in.lx_rest, l.ly_rest = in.ly_rest;
+            const struct incoming in = light_at(a, i, s, sharp);
+            struct light_vector l = { .lx = in.lx, .ly = in.ly, .nl = in.nl, .lx_rest = in.lx_rest, .ly_rest = in.ly_rest };
             l.sl = v_schlick(l.nl), l.gc = v_coat_g(l.nl);
             l.w[0] = in.weight * v_load(a->cr + i), l.w[1] = in.weight * v_load(a->cg + i);
             l.w[2] = in.weight * v_load(a->cb + i);
+            mask_light(&l, k);
             jacobian_light(sum, k, &l, sharp);
         }
-        add_up(&sum[0][0], N_SUMS * 3, &sums[0][0]);
+        add_up(&sum[0][0], N_SUMS * 3, sums->of);
     }
 }
 
@@ -497,16 +539,16 @@ static void brute_jacobian(struct shade_jacobian *out, const struct light_arrays
                            const float v[3], const struct shade_material *m)
 {
     struct constants k;
-    struct material_terms t;
+    struct sums sums = { 0 };
     *out = (struct shade_jacobian){ 0 };
-    if (!find_constants(&k, &t, s, v, m))
+    find_material(&k, m);
+    if (!find_view(&k, s, v, m))
         return;
-    float sums[N_SUMS][3] = { 0 };
     if (k.sharp)
-        brute_all(sums, a, s, &k, true);
+        brute_all(&sums, a, s, &k, true);
     else
-        brute_all(sums, a, s, &k, false);
-    finish(out, sums, &k, &t, m);
+        brute_all(&sums, a, s, &k, false);
+    finish(out, &sums, &k, m);
 }
 
 static void irradiance(float E[3], const struct light_arrays *a, const struct surface_point *s,
@@ -517,7 +559,7 @@ static void irradiance(float E[3], const struct light_arrays *a, const struct su
         const int end = a->n_padded - begin < BLOCK ? a->n_padded : begin + BLOCK;
         vf sum[3] = { v_set1(0), v_set1(0), v_set1(0) };
         for (int i = begin; i < end; i += LANES) {
-            const vf w = v_keep(light_at(a, i, s).weight, visible_bits(visible, i));
+            const vf w = v_keep(light_at(a, i, s, false).weight, visible_bits(visible, i));
             sum[0] = v_fma(w, v_load(a->cr + i), sum[0]);
             sum[1] = v_fma(w, v_load(a->cg + i), sum[1]);
             sum[2] = v_fma(w, v_load(a->cb + i), sum[2]);

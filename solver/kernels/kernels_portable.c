@@ -27,10 +27,6 @@ V vf v_fma(vf a, vf b, vf c)
 {
     return a * b + c;
 }
-V vf v_fnma(vf a, vf b, vf c)
-{
-    return c - a * b;
-}
 V vf v_max(vf a, vf b)
 {
     const vi more = a > b;
@@ -110,5 +106,5 @@ V void add_up(const vf *x, int n, float *sums)
 #include "solver/kernels/kernels_body.h"
 
 const struct kernels kernels_portable_table = {
-    "portable", gather, shade, shade_jacobian, brute_jacobian, irradiance,
+    "portable", gather, shade, shade_jacobian, brute_jacobian, irradiance, shade_jacobian_views,
 };

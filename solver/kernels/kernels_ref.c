@@ -154,6 +154,13 @@ static void shade_jacobian(struct shade_jacobian *out, const struct lit *lit, co
     round_sums(out, &sum);
 }
 
+static void shade_jacobian_views(struct shade_jacobian *out, int n_views, struct lit *lit, const struct surface_point *s,
+                                 const float (*v)[3], const struct shade_material *m)
+{
+    for (int i = 0; i < n_views; i++)
+        shade_jacobian(&out[i], lit, s, v[i], m);
+}
+
 static void brute_jacobian(struct shade_jacobian *out, const struct light_arrays *a, const struct surface_point *s,
                            const float v[3], const struct shade_material *m)
 {
@@ -190,5 +197,5 @@ static void irradiance(float E[3], const struct light_arrays *a, const struct su
 }
 
 const struct kernels kernels_reference_table = {
-    "reference", gather, shade, shade_jacobian, brute_jacobian, irradiance,
+    "reference", gather, shade, shade_jacobian, brute_jacobian, irradiance, shade_jacobian_views,
 };

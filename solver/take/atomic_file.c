@@ -236,6 +236,12 @@ int file_read(char **bytes, size_t *n_bytes, const char *path, size_t max_bytes)
         log_error("file: cannot open %s: %s", path, strerror(-err));
         goto fail;
     }
+    if (!S_ISREG(st.st_mode) && !S_ISFIFO(st.st_mode)) {
+        err = S_ISDIR(st.st_mode) ? -EISDIR : -EINVAL;
+        log_error("file: cannot read %s: it is %s; expected a file", path,
+                  S_ISDIR(st.st_mode) ? "a folder" : "a device or socket");
+        goto fail;
+    }
     if (S_ISREG(st.st_mode) && st.st_size > 0)
         room = (size_t)st.st_size;
     else if (room > max_bytes)

@@ -29,5 +29,6 @@ int atomic_file_commit_path(const char *part_path, const char *path);
 int make_directories(const char *dir);
 
 // The other direction: a whole file of at most max_bytes into *bytes (malloc'd, a NUL after the last byte, never NULL on success).
-// 0 or -errno (logged): -errno of the open or the read, -EFBIG, -ENOMEM. *bytes is NULL on failure.
+// A regular file or a pipe; a folder is -EISDIR, a device -EINVAL. 0 or -errno (logged): -errno of the open or the read, -EFBIG,
+// -ENOMEM. *bytes is NULL on failure.
 int file_read(char **bytes, size_t *n_bytes, const char *path, size_t max_bytes);
