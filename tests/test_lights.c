@@ -889,6 +889,9 @@ static void what_a_hand_may_write_is_read(void **state)
     assert_true(l.inverse_distance[0] == 0 && l.dir_probe[0][2] == 1); // renormalised
     assert_true(l.world_from_probe[0] == 1 && l.centre_m[0] == 0);
     lights_free(&l);
+    assert_int_equal(parse(&l, X_Y_Z "},{" AT("[0,0,-1]", "1e12", "[0,0,-1e12]")), 0); // a sun
+    assert_true(fabs(l.world_from_probe[0] - 1) < 1e-15 && vec3_norm(l.centre_m) < 1e-15);
+    lights_free(&l);
     assert_int_equal(parse(&l, X_Y_Z "},{" TO("[0,-1,0]", "[0,-1,0]")), 0); // not all say it
     assert_true(fabs(l.world_from_probe[0] - 1) < 1e-15 && vec3_norm(l.centre_m) < 1e-15);
     lights_free(&l);
