@@ -60,7 +60,8 @@ static void random_unit(double d[3])
 
 static int channel_of(int value)
 {
-    return value < 3 ? value : value < 3 + 3 * DISNEY_N ? (value - 3) / DISNEY_N : (value - 3 - 3 * DISNEY_N) / 3;
+    enum { THETA = 3, ALBEDO = THETA + 3 * DISNEY_N, OWN = ALBEDO + 9 };
+    return value < THETA ? value : value < ALBEDO ? (value - THETA) / DISNEY_N : value < OWN ? (value - ALBEDO) / 3 : value - OWN;
 }
 
 // Eqs. 1-5 of the floats that the kernels are given, in double.
@@ -89,7 +90,11 @@ static void find_truth(struct scene *s)
         const double nl = fmax(vec3_dot(frame.n, l), 0);
         struct disney_gradient g;
         disney_eval_gradient(&m, &frame, l, v, &g);
-        const double *values = (const double *)&g; // f, theta, albedo first
+        double values[N_VALUES]; // L, theta, albedo as in g; then own
+        memcpy(values, &g, (N_VALUES - 3) * sizeof(double));
+        // f scaled with all of C at once keeps its tint: sum_j C_j df_c/dC_j = C_c own_c.
+        for (int c = 0; c < 3; c++)
+            values[N_VALUES - 3 + c] = m.albedo[c] > 0 ? vec3_dot(g.albedo[c], m.albedo) / m.albedo[c] : g.albedo[c][c];
         for (int j = 0; j < N_VALUES; j++)
             s->truth[j] += values[j] * nl * weight * colour[channel_of(j)];
         for (int c = 0; c < 3; c++) {
@@ -215,9 +220,9 @@ static void assert_small(const struct error *e, const char *kernel, const char *
                  rms, rms_bound);
 }
 
-enum function { SHADE, SHADE_JACOBIAN, BRUTE_JACOBIAN, IRRADIANCE, VIEWS, N_FUNCTIONS };
+enum function { SHADE, SHADE_JACOBIAN, BRUTE_JACOBIAN, IRRADIANCE, VIEWS, AFFINE, N_FUNCTIONS };
 static const char *const function_names[N_FUNCTIONS] = { "shade", "shade_jacobian", "brute_jacobian", "irradiance",
-                                                           "shade_views" };
+                                                           "shade_views", "shade_affine" };
 
 static void add_scene(struct error errors[N_FUNCTIONS], const struct kernels *k, struct scene *s)
 {
@@ -225,7 +230,7 @@ static void add_scene(struct error errors[N_FUNCTIONS], const struct kernels *k,
         struct shade_jacobian j;
         float values[N_VALUES];
     } shared, brute, views[3];
-    float L[3], E[3];
+    float L[3], E[3], constant[3], own[3];
     memset(&shared, 0xff, sizeof(shared)), memset(&brute, 0xff, sizeof(brute));
     k->gather(&s->lit, &s->lights, &s->surface, s->visible, s->soft);
     k->shade(L, &s->lit, &s->surface, s->v, &s->material);
@@ -237,6 +242,13 @@ static void add_scene(struct error errors[N_FUNCTIONS], const struct kernels *k,
     memset(views, 0xff, sizeof(views));
     k->shade_jacobian_views(&views[0].j, 3, &s->lit, &s->surface, v3, &s->material);
     k->irradiance(E, &s->lights, &s->surface, s->visible);
+    k->shade_affine(constant, own, &s->lit, &s->surface, s->v, &s->material);
+    for (int c = 0; c < 3; c++) {
+        const double true_own = s->truth[N_VALUES - 3 + c], L_c = s->truth[c];
+        const double scale = fmax(s->arriving[c], fmax(true_own, L_c));
+        add_error(&errors[AFFINE], (double)own[c] - true_own, scale);
+        add_error(&errors[AFFINE], (double)constant[c] - (L_c - true_own * (double)s->material.albedo[c]), scale);
+    }
     const bool whole = !s->visible && !s->soft; // brute force knows no visibility
     if (whole)
         k->brute_jacobian(&brute.j, &s->lights, &s->surface, s->v, &s->material);
@@ -345,6 +357,7 @@ static void only_lights_that_arrive_are_kept(void **state)
             make_scene(&s, HIDDEN, 80000 + id);
             kernels->gather(&s.lit, &s.lights, &s.surface, s.visible, NULL);
             int expected = 0;
+            const int32_t *index = s.lit.index;
             for (int i = 0; i < s.n; i++) {
                 const struct light_arrays *a = &s.lights;
                 const double d[3] = { (double)a->dx[i], (double)a->dy[i], (double)a->dz[i] };
@@ -353,13 +366,16 @@ static void only_lights_that_arrive_are_kept(void **state)
                     u[c] = d[c] + (double)a->q[i] * ((double)a->centre_m[c] - (double)s.surface.position_m[c]);
                     n[c] = (double)s.surface.normal[c];
                 }
-                expected += vec3_dot(u, n) > 0 && vec3_dot(u, d) > 0 && (s.visible[i / 16] >> i % 16 & 1);
+                if (vec3_dot(u, n) > 0 && vec3_dot(u, d) > 0 && (s.visible[i / 16] >> i % 16 & 1)) {
+                    assert_true(expected < s.lit.n);
+                    assert_int_equal(index[expected++], i);
+                }
             }
             assert_int_equal(s.lit.n, expected);
             for (int i = 0; i < s.lit.n; i++)
                 assert_true(s.lit.nl[i] > 0 && s.lit.wr[i] >= 0);
             for (int i = s.lit.n; i % KERNEL_WIDTH; i++)
-                assert_true(s.lit.wr[i] == 0 && s.lit.wg[i] == 0 && s.lit.wb[i] == 0);
+                assert_true(s.lit.wr[i] == 0 && s.lit.wg[i] == 0 && s.lit.wb[i] == 0 && index[i] == 0);
             free_scene(&s);
         }
     }
@@ -381,6 +397,10 @@ static void a_view_from_below_sees_nothing(void **state)
         kernels->gather(&s.lit, &s.lights, &s.surface, NULL, NULL);
         kernels->shade(L, &s.lit, &s.surface, s.v, &s.material);
         assert_true(L[0] == 0 && L[1] == 0 && L[2] == 0);
+        float constant[3] = { 1, 1, 1 }, own[3] = { 1, 1, 1 };
+        kernels->shade_affine(constant, own, &s.lit, &s.surface, s.v, &s.material);
+        for (int c = 0; c < 3; c++)
+            assert_true(constant[c] == 0 && own[c] == 0);
         memset(&j, 0xff, sizeof(j));
         kernels->shade_jacobian(&j, &s.lit, &s.surface, s.v, &s.material);
         assert_memory_equal(&j, &zero, sizeof(j));
@@ -478,6 +498,8 @@ static void times_are_printed(void **state)
                     kernels->brute_jacobian(&j, &s.lights, &s.surface, s.v, &s.material);
                 else if (f == VIEWS)
                     kernels->shade_jacobian_views(&j, 1, &s.lit, &s.surface, &s.v, &s.material);
+                else if (f == AFFINE)
+                    kernels->shade_affine(j.L, j.own, &s.lit, &s.surface, s.v, &s.material);
                 else
                     kernels->irradiance(L, &s.lights, &s.surface, NULL);
             printf("# %-9s %-14s %.2f ns per sample and light\n", names[k], function_names[f], 1e9 * spent / (double)n);

@@ -1,7 +1,7 @@
 // solver/kernels/kernels_body.h - the float kernels, written once over a vector type; each instruction set's file defines
 //   vf, LANES floats (LANES divides KERNEL_WIDTH), and vd, half as many doubles;
 //   v_set1 v_load v_store v_max v_fma(a,b,c) = ab+c, v_rcp, v_rsqrt_sqrt (returns 1/sqrt, stores sqrt);
-//   v_mask: v_positive(x, bits) v_count v_compress; v_keep v_bytes add_up; d_set1 d_fma d_fnma(a,b,c) = c-ab d_wide(x, half) d_narrow(a, b)
+//   v_mask: v_positive(x, bits) v_count v_compress v_compress_index(p, first, mask); v_keep v_bytes add_up; d_set1 d_fma d_fnma(a,b,c) = c-ab d_wide(x, half) d_narrow(a, b)
 // and includes this file.
 //
 // Light and view directions are in the surface's own frame (x, y, n), where the horizon is a sign and alpha is diagonal.
@@ -167,9 +167,12 @@ INLINE void half_vector(vf *sx, vf *sy, vf *sz, const struct constants *k, const
         *sx += l->lx_rest + v_set1(k->vx_rest), *sy += l->ly_rest + v_set1(k->vy_rest);
 }
 
-// The value alone: base[c] is what the diffuse lobe is multiplied by, sheen[c] what FH is.
-INLINE void shade_light(vf sum[3], const struct constants *k, const struct light_vector *l, bool sharp,
-                        const float base[3], const float sheen[3], bool subsurface, bool coat)
+// What f consists of, without the factors that differ between the channels.
+struct lobes {
+    vf diffuse, fh, gdn, rest; // mix(Fd, ss); FH; GD (1-FH), of which a channel takes F0; GD FH + coat
+};
+
+INLINE struct lobes lobes_of(const struct constants *k, const struct light_vector *l, bool sharp, bool subsurface, bool coat)
 {
     const vf one = v_set1(1);
     vf sx, sy, sz;
@@ -192,16 +195,36 @@ INLINE void shade_light(vf sum[3], const struct constants *k, const struct light
     vf root;
     v_rsqrt_sqrt(root2, &root);
     const vf gd = d * d * v_rcp(l->nl + root) * v_set1(k->scale_gd);
-    vf gdf = gd * fh;
-    const vf gdn = gd - gdf;
+    vf rest = gd * fh;
+    const vf gdn = gd - rest;
     if (coat) {
         const vf dc = s2 * v_rcp(v_fma(z2, v_set1(k->a2), xy2));
-        gdf = v_fma(l->gc * dc, v_fma(fh, v_set1(.96f * k->scale_coat), v_set1(.04f * k->scale_coat)), gdf);
+        rest = v_fma(l->gc * dc, v_fma(fh, v_set1(.96f * k->scale_coat), v_set1(.04f * k->scale_coat)), rest);
     }
+    return (struct lobes){ diffuse, fh, gdn, rest };
+}
+
+// The value alone: base[c] is what the diffuse lobe is multiplied by, sheen[c] what FH is.
+INLINE void shade_light(vf sum[3], const struct constants *k, const struct light_vector *l, bool sharp,
+                        const float base[3], const float sheen[3], bool subsurface, bool coat)
+{
+    const struct lobes f = lobes_of(k, l, sharp, subsurface, coat);
     for (int c = 0; c < 3; c++) {
-        const vf value = v_fma(diffuse, v_set1(base[c]),
-                               v_fma(fh, v_set1(sheen[c]), v_fma(gdn, v_set1(k->f0[c]), gdf)));
+        const vf value = v_fma(f.diffuse, v_set1(base[c]),
+                               v_fma(f.fh, v_set1(sheen[c]), v_fma(f.gdn, v_set1(k->f0[c]), f.rest)));
         sum[c] = v_fma(l->w[c], value, sum[c]);
+    }
+}
+
+// sum: constant, then own. base and metallic are the shares of own; of the constant, sheen[c] is FH's and specular[c] GD (1-FH)'s.
+INLINE void affine_light(vf sum[6], const struct constants *k, const struct light_vector *l, bool sharp, float base,
+                         float metallic, const float sheen[3], const float specular[3])
+{
+    const struct lobes f = lobes_of(k, l, sharp, true, true);
+    const vf own = v_fma(f.diffuse, v_set1(base), f.gdn * v_set1(metallic));
+    for (int c = 0; c < 3; c++) {
+        const vf constant = v_fma(f.fh, v_set1(sheen[c]), v_fma(f.gdn, v_set1(specular[c]), f.rest));
+        sum[c] = v_fma(l->w[c], constant, sum[c]), sum[3 + c] = v_fma(l->w[c], own, sum[3 + c]);
     }
 }
 
@@ -294,9 +317,10 @@ static void finish(struct shade_jacobian *out, const struct sums *sums, const st
     d[DISNEY_CLEARCOAT] = coat;
     d[DISNEY_CLEARCOAT_GLOSS] = clearcoat * gloss;
     const v4 by_tint = dielectric * ilum * (sheen * sheen_tint * fh + .08f * specular * specular_tint * gdn);
-    const v4 by_self = dielectric * base + metallic * gdn + by_tint, weight = { .3f, .6f, .1f, 0 };
+    const v4 own = dielectric * base + metallic * gdn, by_self = own + by_tint, weight = { .3f, .6f, .1f, 0 };
     for (int c = 0; c < 3; c++) {
         out->L[c] = L[c];
+        out->own[c] = own[c];
         for (int i = 0; i < DISNEY_N; i++)
             out->theta[c][i] = d[i][c];
         const v4 row = by_tint[c] * -k->tint[c] * weight;
@@ -428,6 +452,46 @@ static void shade(float L[3], const struct lit *lit, const struct surface_point 
         L[c] = sums[c];
 }
 
+INLINE void affine_all(float sums[6], const struct lit *lit, const struct constants *k, bool sharp, float base, float metallic,
+                       const float sheen[3], const float specular[3])
+{
+    for (int begin = 0; begin < lit->n; begin += BLOCK) {
+        const int end = lit->n - begin < BLOCK ? lit->n : begin + BLOCK;
+        vf sum[6];
+        for (int i = 0; i < 6; i++)
+            sum[i] = v_set1(0);
+        for (int i = begin; i < end; i += LANES) {
+            struct light_vector l;
+            load_lit(&l, lit, i, sharp);
+            affine_light(sum, k, &l, sharp, base, metallic, sheen, specular);
+        }
+        add_up(sum, 6, sums);
+    }
+}
+
+static void shade_affine(float constant[3], float own[3], const struct lit *lit, const struct surface_point *s,
+                         const float v[3], const struct shade_material *m)
+{
+    struct constants k;
+    float sums[6] = { 0 };
+    find_material(&k, m);
+    if (find_view(&k, s, v, m)) {
+        const float metallic = m->theta[DISNEY_METALLIC], dielectric = 1 - metallic;
+        float sheen[3], specular[3];
+        for (int c = 0; c < 3; c++) {
+            sheen[c] = dielectric * m->theta[DISNEY_SHEEN] * k.sheen_colour[c];
+            specular[c] = dielectric * k.f0_dielectric[c];
+        }
+        k.scale_coat *= m->theta[DISNEY_CLEARCOAT];
+        if (k.sharp)
+            affine_all(sums, lit, &k, true, dielectric * (float)M_1_PI, metallic, sheen, specular);
+        else
+            affine_all(sums, lit, &k, false, dielectric * (float)M_1_PI, metallic, sheen, specular);
+    }
+    for (int c = 0; c < 3; c++)
+        constant[c] = sums[c], own[c] = sums[3 + c];
+}
+
 // Eqs. 1-4 for LANES lights: direction in the surface's frame and nl max(<u,d>,0)/|u|^3, with u = d + q (centre - p).
 struct incoming {
     vf lx, ly, nl, weight, lx_rest, ly_rest;
@@ -500,6 +564,7 @@ static void gather(struct lit *out, const struct light_arrays *a, const struct s
         v_compress(out->wr + n, in.weight * v_load(a->cr + i), keep);
         v_compress(out->wg + n, in.weight * v_load(a->cg + i), keep);
         v_compress(out->wb + n, in.weight * v_load(a->cb + i), keep);
+        v_compress_index(out->index + n, i, keep);
         n += v_count(keep);
     }
     out->n = n;
@@ -507,6 +572,7 @@ static void gather(struct lit *out, const struct light_arrays *a, const struct s
         out->lx[i] = out->ly[i] = out->lx_rest[i] = out->ly_rest[i] = 0;
         out->wr[i] = out->wg[i] = out->wb[i] = 0;
         out->nl[i] = 1;
+        out->index[i] = 0;
     }
     for (int i = 0; i < n; i += LANES) {
         const vf nl = v_load(out->nl + i);

@@ -88,6 +88,13 @@ V void v_compress(float *p, vf x, v_mask m)
         p += m >> i & 1;
     }
 }
+V void v_compress_index(int32_t *p, int first, v_mask m)
+{
+    for (int i = 0; i < LANES; i++) {
+        *p = first + i;
+        p += m >> i & 1;
+    }
+}
 V vf v_bytes(const uint8_t *p, int n)
 {
     vf x = v_set1(0);
@@ -107,4 +114,5 @@ V void add_up(const vf *x, int n, float *sums)
 
 const struct kernels kernels_portable_table = {
     "portable", gather, shade, shade_jacobian, brute_jacobian, irradiance, shade_jacobian_views,
+    shade_affine, 0, 0,
 };

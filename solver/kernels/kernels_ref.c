@@ -66,12 +66,14 @@ static void gather(struct lit *out, const struct light_arrays *a, const struct s
         out->wr[n] = (float)(w * (double)a->cr[i]);
         out->wg[n] = (float)(w * (double)a->cg[i]);
         out->wb[n] = (float)(w * (double)a->cb[i]);
+        out->index[n] = i;
         n++;
     }
     out->n = n;
     for (; n % KERNEL_WIDTH; n++) {
         out->lx[n] = out->ly[n] = out->lx_rest[n] = out->ly_rest[n] = out->sl[n] = out->wr[n] = out->wg[n] = out->wb[n] = 0;
         out->nl[n] = out->gc[n] = 1;
+        out->index[n] = 0;
     }
 }
 
@@ -110,16 +112,31 @@ static void shade(float L[3], const struct lit *lit, const struct surface_point 
 }
 
 struct sums {
-    double L[3], theta[3][DISNEY_N], albedo[3][3];
+    double L[3], theta[3][DISNEY_N], albedo[3][3], own[3];
 };
+
+// f's derivative by albedo of the same channel at fixed tint T: f's own where nothing has the tint's colour.
+static void own_albedo(double own[3], const struct disney *material, const struct disney_frame *frame, const double l[3],
+                       const double v[3])
+{
+    struct disney untinted = *material;
+    struct disney_gradient g;
+    untinted.theta[DISNEY_SPECULAR_TINT] = untinted.theta[DISNEY_SHEEN_TINT] = 0;
+    disney_eval_gradient(&untinted, frame, l, v, &g);
+    for (int c = 0; c < 3; c++)
+        own[c] = g.albedo[c][c];
+}
 
 static void add_light(struct sums *sum, const struct disney *material, const struct disney_frame *frame,
                       const double l[3], const double v[3], const double w[3])
 {
     struct disney_gradient g;
+    double own[3];
     disney_eval_gradient(material, frame, l, v, &g);
+    own_albedo(own, material, frame, l, v);
     for (int c = 0; c < 3; c++) {
         sum->L[c] += g.f[c] * w[c];
+        sum->own[c] += own[c] * w[c];
         for (int i = 0; i < DISNEY_N; i++)
             sum->theta[c][i] += g.theta[c][i] * w[c];
         for (int i = 0; i < 3; i++)
@@ -131,6 +148,7 @@ static void round_sums(struct shade_jacobian *out, const struct sums *sum)
 {
     for (int c = 0; c < 3; c++) {
         out->L[c] = (float)sum->L[c];
+        out->own[c] = (float)sum->own[c];
         for (int i = 0; i < DISNEY_N; i++)
             out->theta[c][i] = (float)sum->theta[c][i];
         for (int i = 0; i < 3; i++)
@@ -159,6 +177,27 @@ static void shade_jacobian_views(struct shade_jacobian *out, int n_views, struct
 {
     for (int i = 0; i < n_views; i++)
         shade_jacobian(&out[i], lit, s, v[i], m);
+}
+
+static void shade_affine(float constant[3], float own[3], const struct lit *lit, const struct surface_point *s,
+                         const float v[3], const struct shade_material *m)
+{
+    const struct disney material = material_of(m);
+    double view[3], sum_constant[3] = { 0 }, sum_own[3] = { 0 };
+    to_own_frame(view, s, v);
+    for (int i = 0; i < lit->n; i++) {
+        const double w[3] = { (double)lit->wr[i], (double)lit->wg[i], (double)lit->wb[i] };
+        double l[3], f[3], f_own[3];
+        lit_direction(l, lit, i);
+        disney_eval(&material, &own_frame, l, view, f);
+        own_albedo(f_own, &material, &own_frame, l, view);
+        for (int c = 0; c < 3; c++) {
+            sum_constant[c] += (f[c] - f_own[c] * material.albedo[c]) * w[c];
+            sum_own[c] += f_own[c] * w[c];
+        }
+    }
+    for (int c = 0; c < 3; c++)
+        constant[c] = (float)sum_constant[c], own[c] = (float)sum_own[c];
 }
 
 static void brute_jacobian(struct shade_jacobian *out, const struct light_arrays *a, const struct surface_point *s,
@@ -198,4 +237,5 @@ static void irradiance(float E[3], const struct light_arrays *a, const struct su
 
 const struct kernels kernels_reference_table = {
     "reference", gather, shade, shade_jacobian, brute_jacobian, irradiance, shade_jacobian_views,
+    shade_affine, 0, 0,
 };

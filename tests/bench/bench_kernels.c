@@ -87,7 +87,7 @@ static void build_studio(void)
     }
 }
 
-enum way { BRUTE, SHARED, VIEWS, VALUE, GATHER, PEER_PLAIN, PEER_FIXED, PEER_CAREFUL };
+enum way { BRUTE, SHARED, VIEWS, VALUE, AFFINE, GATHER, PEER_PLAIN, PEER_FIXED, PEER_CAREFUL };
 struct method {
     const char *kernel, *what;
     enum way way;
@@ -107,10 +107,13 @@ static struct method methods[] = {
     { "avx512", "gathered per texel, exact", SHARED, N_TEXELS, N_VIEWS, { 0 }, 0 },
     { "portable", "shared by all views, exact", VIEWS, 32, N_VIEWS, { 0 }, 0 },
     { "portable", "shared, value only", VALUE, 32, N_VIEWS, { 0 }, 0 },
+    { "portable", "shared, affine in albedo", AFFINE, 32, N_VIEWS, { 0 }, 0 },
     { "avx2", "shared by all views, exact", VIEWS, N_TEXELS, N_VIEWS, { 0 }, 0 },
     { "avx2", "shared, value only", VALUE, N_TEXELS, N_VIEWS, { 0 }, 0 },
+    { "avx2", "shared, affine in albedo", AFFINE, N_TEXELS, N_VIEWS, { 0 }, 0 },
     { "avx512", "shared by all views, exact", VIEWS, N_TEXELS, N_VIEWS, { 0 }, 0 },
     { "avx512", "shared, value only", VALUE, N_TEXELS, N_VIEWS, { 0 }, 0 },
+    { "avx512", "shared, affine in albedo", AFFINE, N_TEXELS, N_VIEWS, { 0 }, 0 },
     { "portable", "gather alone, 1 view", GATHER, N_TEXELS, 1, { 0 }, 0 },
     { "avx2", "gather alone, 1 view", GATHER, N_TEXELS, 1, { 0 }, 0 },
     { "avx512", "gather alone, 1 view", GATHER, N_TEXELS, 1, { 0 }, 0 },
@@ -150,7 +153,7 @@ static double run(const struct method *m)
     const double begin = cpu_s();
     for (int t = 0; t < m->n_texels; t++) {
         const struct texel *texel = &texels[t];
-        if (m->way == SHARED || m->way == VIEWS || m->way == VALUE || m->way == GATHER)
+        if (m->way == SHARED || m->way == VIEWS || m->way == VALUE || m->way == AFFINE || m->way == GATHER)
             k->gather(&lit, &lights, &texel->surface, NULL, NULL);
         if (m->way == VIEWS) {
             struct shade_jacobian j[N_VIEWS];
@@ -166,6 +169,8 @@ static double run(const struct method *m)
                 k->shade_jacobian(&j, &lit, &texel->surface, texel->view[i], &texel->material);
             else if (m->way == VALUE)
                 k->shade(j.L, &lit, &texel->surface, texel->view[i], &texel->material);
+            else if (m->way == AFFINE)
+                k->shade_affine(j.L, j.own, &lit, &texel->surface, texel->view[i], &texel->material);
             else
                 peer(L, jacobian, (int)m->way - PEER_PLAIN, texel, texel->view[i]), j.L[0] = (float)L[0];
             sink = j.L[0];
