@@ -73,9 +73,9 @@ int lit_new(struct lit *out, int n_lights)
     struct lit l = { .capacity = padded(n_lights) + KERNEL_WIDTH };
     float *index;
     float **const arrays[] = { &l.lx, &l.ly, &l.nl, &l.sl, &l.gc, &l.wr, &l.wg, &l.wb,
-                               &l.lx_rest, &l.ly_rest, &l.g, &l.g_r, &l.g_a, &index };
+                               &l.lx_rest, &l.ly_rest, &l.g, &l.g_r, &l.g_a, &l.facing, &index };
     static_assert(sizeof(*l.index) == sizeof(*index), "index lies in the same block");
-    const int err = new_arrays(arrays, 14, l.capacity);
+    const int err = new_arrays(arrays, 15, l.capacity);
     if (err)
         return err;
     l.index = (int32_t *)index;
