@@ -373,20 +373,28 @@ INLINE void jacobian_all(struct sums *sums, const struct lit *lit, const struct 
     }
 }
 
+// False, and all 0, when the view is below the horizon.
+static bool find_jacobian(struct shade_jacobian *out, struct constants *k, const struct lit *lit, const struct surface_point *s,
+                          const float v[3], const struct shade_material *m)
+{
+    struct sums sums = { 0 };
+    *out = (struct shade_jacobian){ 0 };
+    find_material(k, m);
+    if (!find_view(k, s, v, m))
+        return false;
+    if (k->sharp)
+        jacobian_all(&sums, lit, k, true, false);
+    else
+        jacobian_all(&sums, lit, k, false, false);
+    finish(out, &sums, k, m);
+    return true;
+}
+
 static void shade_jacobian(struct shade_jacobian *out, const struct lit *lit, const struct surface_point *s,
                            const float v[3], const struct shade_material *m)
 {
     struct constants k;
-    struct sums sums = { 0 };
-    *out = (struct shade_jacobian){ 0 };
-    find_material(&k, m);
-    if (!find_view(&k, s, v, m))
-        return;
-    if (k.sharp)
-        jacobian_all(&sums, lit, &k, true, false);
-    else
-        jacobian_all(&sums, lit, &k, false, false);
-    finish(out, &sums, &k, m);
+    find_jacobian(out, &k, lit, s, v, m);
 }
 
 static void shade_jacobian_views(struct shade_jacobian *out, int n_views, struct lit *lit, const struct surface_point *s,
@@ -668,11 +676,9 @@ static void shade_setup(struct shade_jacobian *out, struct shade_setup *setup, c
     struct constants k;
     struct moving moving = find_moving(a, s);
     float sums[N_SETUP_SUMS] = { 0 };
-    shade_jacobian(out, lit, s, v, m);
     for (int c = 0; c < 3; c++)
         memset(setup->inverse_distance[c], 0, (size_t)a->n_padded * sizeof(float));
-    find_material(&k, m);
-    if (find_view(&k, s, v, m)) {
+    if (find_jacobian(out, &k, lit, s, v, m)) {
         const float dielectric = 1 - m->theta[DISNEY_METALLIC];
         for (int c = 0; c < 3; c++) {
             moving.base[c] = dielectric * m->albedo[c] * (float)M_1_PI;

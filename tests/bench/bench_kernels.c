@@ -32,7 +32,9 @@ struct texel {
 static struct light_arrays lights;
 static struct lit lit;
 static _Alignas(64) float by_inverse_distance[3][N_LIGHTS];
-static struct shade_setup setup = { .inverse_distance = { by_inverse_distance[0], by_inverse_distance[1], by_inverse_distance[2] } };
+static struct shade_setup setup = {
+    .inverse_distance = { by_inverse_distance[0], by_inverse_distance[1], by_inverse_distance[2] },
+};
 static struct texel texels[N_TEXELS];
 static volatile float sink;
 
