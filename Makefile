@@ -34,11 +34,11 @@ endif
 # ---- what is built ------------------------------------------------------------------------------------------------------
 TAKE := $(addprefix solver/take/,atomic_file.c image.c image_exr.c image_hdr.c image_png.c image_tiff.c json.c log.c progress.c take.c)
 SOLVER := $(addprefix solver/,cameras.c cameras_colmap.c compare.c csv.c disney.c lights.c mesh.c mesh_import.c panorama.c parallel.c \
-  rays.c render.c shapes.c synth.c texels.c visibility.c)
+  rays.c render.c samples.c shapes.c synth.c texels.c visibility.c)
 KERNELS := $(addprefix solver/kernels/,kernels.c kernels_ref.c kernels_portable.c kernels_avx2.c kernels_avx512.c)
 COMMANDS := $(addprefix solver/commands/,brdf.c compare.c lights.c render.c synth.c visibility.c)
 LIBRARY := $(TAKE) $(SOLVER) $(KERNELS)
-TESTS := $(addprefix test_,brdf cameras compare csv disney image json lights mesh panorama parallel rays render shapes synth take texels vec3 visibility) check_kernels
+TESTS := $(addprefix test_,brdf cameras compare csv disney image json lights mesh panorama parallel rays render samples shapes synth take texels vec3 visibility) check_kernels
 FUZZERS := cameras csv exr hdr json lights mesh
 
 # ---- rules --------------------------------------------------------------------------------------------------------------
