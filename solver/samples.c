@@ -27,6 +27,8 @@ enum { CHUNK_TEXELS = 256, CHUNK_ROWS = 4, MAX_FOOTPRINT_PX = 8, MAX_VIEWS = UIN
 // than this many texels plus this share of its distance along the plane: the mesh bends, and its
 // normals are interpolated over flat facets.
 static const double LEAVE_TEXELS = 4, BEND = .25;
+// The gradient is the difference of two means this far to either side.
+static const double GRADIENT_STEP_PX = .5;
 
 struct samples_settings samples_defaults(void)
 {
@@ -49,8 +51,8 @@ static double half_side(double spread_px)
 }
 
 // A texel is a square of texel_size_m on the surface, a parallelogram in the picture; the box has
-// its spread along x and y. A box of one pixel is bilinear interpolation. False: not wholly inside
-// the picture.
+// its spread along x and y. A box of one pixel is bilinear interpolation. False: the box, or those
+// that the gradient compares, leave the picture.
 static bool footprint_of(struct footprint *f, const struct texels *t, int64_t i,
                          const struct camera *camera)
 {
@@ -69,8 +71,10 @@ static bool footprint_of(struct footprint *f, const struct texels *t, int64_t i,
     f->u_px = uv_px[0], f->v_px = uv_px[1];
     f->half_width_px = half_side(hypot(M[0], M[1]));
     f->half_height_px = half_side(hypot(M[2], M[3]));
-    if (!(f->u_px - f->half_width_px >= 0 && f->u_px + f->half_width_px <= camera->width_px &&
-          f->v_px - f->half_height_px >= 0 && f->v_px + f->half_height_px <= camera->height_px))
+    const double x_reach = f->half_width_px + GRADIENT_STEP_PX,
+                 y_reach = f->half_height_px + GRADIENT_STEP_PX;
+    if (!(f->u_px >= x_reach && f->u_px <= camera->width_px - x_reach && f->v_px >= y_reach &&
+          f->v_px <= camera->height_px - y_reach))
         return false;
     f->x0 = (int)(f->u_px - f->half_width_px), f->x1 = (int)ceil(f->u_px + f->half_width_px);
     f->y0 = (int)(f->v_px - f->half_height_px), f->y1 = (int)ceil(f->v_px + f->half_height_px);
@@ -176,9 +180,10 @@ static bool sees_only_its_surface(const struct view_job *job, int64_t i, const s
     return true;
 }
 
-static int inside(int i, int n)
+static const float *pixel_at(const struct image *image, int x, int y)
 {
-    return i < 0 ? 0 : i < n ? i : n - 1;
+    return image->data +
+           ((size_t)y * (size_t)image->width + (size_t)x) * (size_t)image->n_channels;
 }
 
 // The mean over the footprint moved by (dx, dy): every pixel by the area it shares with the box.
@@ -186,16 +191,16 @@ static void mean_over(double rgb[3], const struct view_job *job, const struct fo
                       double dx_px, double dy_px)
 {
     const struct image *image = job->image;
-    const double x0 = f->u_px + dx_px - f->half_width_px, x1 = x0 + 2 * f->half_width_px;
-    const double y0 = f->v_px + dy_px - f->half_height_px, y1 = y0 + 2 * f->half_height_px;
+    const double u_px = f->u_px + dx_px, v_px = f->v_px + dy_px; // inside but for rounding
+    const double x0 = fmax(u_px - f->half_width_px, 0), y0 = fmax(v_px - f->half_height_px, 0);
+    const double x1 = fmin(u_px + f->half_width_px, image->width),
+                 y1 = fmin(v_px + f->half_height_px, image->height);
     rgb[0] = rgb[1] = rgb[2] = 0;
-    for (int y = (int)floor(y0); y < y1; y++) {
+    for (int y = (int)y0; y < y1; y++) {
         const double rows = fmin(y + 1, y1) - fmax(y, y0);
-        const float *row = image->data + (size_t)inside(y, image->height) * (size_t)image->width *
-                                             (size_t)image->n_channels;
-        for (int x = (int)floor(x0); x < x1; x++) {
+        for (int x = (int)x0; x < x1; x++) {
             const double area = rows * (fmin(x + 1, x1) - fmax(x, x0));
-            const float *pixel = row + inside(x, image->width) * image->n_channels;
+            const float *pixel = pixel_at(image, x, y);
             for (int c = 0; c < 3; c++)
                 rgb[c] += area * (double)pixel[job->rgb[c]];
         }
@@ -217,9 +222,7 @@ static bool is_clipped(const struct view_job *job, const struct footprint *f)
     const float white = job->settings->white > 0 ? (float)job->settings->white : INFINITY;
     for (int y = f->y0; y < f->y1; y++)
         for (int x = f->x0; x < f->x1; x++) {
-            const float *pixel =
-                job->image->data + ((size_t)y * (size_t)job->image->width + (size_t)x) *
-                                       (size_t)job->image->n_channels;
+            const float *pixel = pixel_at(job->image, x, y);
             if (job->clip >= 0 ? pixel[job->clip] > .5f
                                : pixel[job->rgb[0]] >= white || pixel[job->rgb[1]] >= white ||
                                      pixel[job->rgb[2]] >= white)
@@ -241,12 +244,13 @@ static void read_texels(void *arg, int64_t begin, int64_t end, int worker)
             continue;
         }
         double rgb[3];
+        const double step = GRADIENT_STEP_PX;
+        const double across = luminance_at(job, &f, step, 0) - luminance_at(job, &f, -step, 0),
+                     down = luminance_at(job, &f, 0, step) - luminance_at(job, &f, 0, -step);
         mean_over(rgb, job, &f, 0, 0);
-        const double gradient = hypot(luminance_at(job, &f, .5, 0) - luminance_at(job, &f, -.5, 0),
-                                      luminance_at(job, &f, 0, .5) - luminance_at(job, &f, 0, -.5));
         for (int c = 0; c < 3; c++)
             job->value[i][c] = half_from_float((float)rgb[c]);
-        job->value[i][3] = half_from_float((float)gradient);
+        job->value[i][3] = half_from_float((float)(hypot(across, down) / (2 * step)));
         job->flags[i] = is_clipped(job, &f) ? SAMPLE_CLIPPED : 0;
     }
 }
