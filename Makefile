@@ -11,7 +11,7 @@ BUILD := build$(if $(filter-out release,$(VARIANT)),/$(VARIANT))
 MACHINE := $(shell uname -m)
 
 # ---- packages (Debian 12; the same names in Debian 13) ----------------------------------------------------------------
-PACKAGES := gcc make pkg-config libopenexr-dev libembree-dev libassimp-dev libjansson-dev libtiff-dev libpng-dev libcmocka-dev perl help2man
+PACKAGES := gcc make pkg-config libopenexr-dev libembree-dev libassimp-dev libjansson-dev libtiff-dev libpng-dev liblapacke-dev libopenblas-dev libcmocka-dev perl help2man
 PACKAGES_FUZZ := clang libclang-rt-dev
 PACKAGES_BENCH := libceres-dev g++ gnuplot-nox
 
@@ -24,7 +24,7 @@ CFLAGS_ALL = -std=gnu11 -D_GNU_SOURCE $(FLAGS_$(VARIANT)) -Wall -Wextra -Wshadow
   -ffp-contract=off -ffile-prefix-map=$(CURDIR)=. -pthread -I. -I/usr/include/OpenEXR -I/usr/include/Imath \
   -DSTUDIORIG_VERSION='"$(VERSION)"' $(CFLAGS)
 EMBREE = $(shell test -e /usr/include/embree4/rtcore.h && echo embree4 || echo embree3)
-LIBS = -lOpenEXRCore -l$(EMBREE) -lassimp -ljansson -ltiff -lpng -lm
+LIBS = -lOpenEXRCore -l$(EMBREE) -lassimp -ljansson -ltiff -lpng -llapacke -lopenblas -lm
 ifeq ($(MACHINE),x86_64)
 ISA_avx2 := -mavx2 -mfma
 ISA_avx512 := -mavx512f -mavx512dq -mavx512bw -mavx512vl -mfma -mprefer-vector-width=512
@@ -32,13 +32,14 @@ endif
 
 # ---- what is built ------------------------------------------------------------------------------------------------------
 TAKE := $(addprefix solver/take/,atomic_file.c image.c image_exr.c image_hdr.c image_png.c image_tiff.c json.c log.c progress.c take.c)
-SOLVER := $(addprefix solver/,cameras.c cameras_colmap.c compare.c csv.c disney.c lights.c mesh.c mesh_import.c orientation.c panorama.c parallel.c \
-  rays.c render.c shapes.c synth.c texels.c visibility.c)
+SOLVER := $(addprefix solver/,cameras.c cameras_colmap.c compare.c csv.c disney.c joint.c lights.c lm.c mesh.c mesh_import.c \
+  normal_equations.c orientation.c panorama.c parallel.c pcg.c photometric.c rays.c render.c samples.c shapes.c synth.c \
+  texels.c visibility.c)
 KERNELS := $(addprefix solver/kernels/,kernels.c kernels_ref.c kernels_portable.c kernels_avx2.c kernels_avx512.c)
-COMMANDS := $(addprefix solver/commands/,brdf.c compare.c lights.c render.c synth.c visibility.c)
+COMMANDS := $(addprefix solver/commands/,brdf.c compare.c lights.c render.c solve.c synth.c visibility.c)
 LIBRARY := $(TAKE) $(SOLVER) $(KERNELS)
 FUZZED := $(TAKE) $(filter-out %/render.c %/synth.c,$(SOLVER))
-TESTS := $(addprefix test_,brdf cameras compare csv disney image json lights mesh orientation panorama parallel rays render shapes synth take texels vec3 visibility) check_kernels
+TESTS := $(addprefix test_,brdf cameras compare csv disney image json lights lm mesh orientation panorama parallel rays render samples shapes synth take texels vec3 visibility) check_kernels
 FUZZERS := cameras csv exr hdr json lights mesh
 
 # ---- rules --------------------------------------------------------------------------------------------------------------
