@@ -316,7 +316,10 @@ static int choose_held_out(struct scene *scene, const struct settings *s)
         return err;
     char *save = NULL;
     for (char *name = strtok_r(text, "\r\n", &save); name; name = strtok_r(NULL, "\r\n", &save)) {
-        const struct camera *found = cameras_find(c, name);
+        char stem[CAMERA_NAME_MAX]; // "views/cam001.exr" names cam001
+        const char *base = strrchr(name, '/') ? strrchr(name, '/') + 1 : name, *dot = strrchr(base, '.');
+        snprintf(stem, sizeof(stem), "%.*s", (int)(dot ? dot - base : (long)strlen(base)), base);
+        const struct camera *found = cameras_find(c, name) ? cameras_find(c, name) : cameras_find(c, stem);
         if (!found) {
             log_error("solve: %s: there is no view '%s' among the cameras", s->hold_out + 5, name);
             free(text);
