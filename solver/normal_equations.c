@@ -6,8 +6,13 @@
 #include <stdlib.h>
 #include <string.h>
 
+// OpenBLAS would spin threads of its own beside ours; other BLAS libraries lack the function.
+extern void openblas_set_num_threads(int n) __attribute__((weak));
+
 int normal_rows_new(struct normal_rows *a, int n)
 {
+    if (openblas_set_num_threads)
+        openblas_set_num_threads(1);
     memset(a, 0, sizeof(*a));
     a->n = n;
     a->n_padded = (n + 15) / 16 * 16;

@@ -222,7 +222,6 @@ struct scene {
     struct panorama panorama;
     struct lights lights;
     struct samples samples;
-    int32_t *group;
     uint8_t *held_out;
     char **image_paths;
     char *owned_paths[1];
@@ -233,7 +232,6 @@ static void free_scene(struct scene *s)
     for (int i = 0; s->image_paths && i < s->cameras.n; i++)
         free(s->image_paths[i]);
     free(s->image_paths);
-    free(s->group);
     free(s->held_out);
     samples_free(&s->samples);
     lights_free(&s->lights);
@@ -339,11 +337,8 @@ static int load_lights(struct scene *scene, const struct settings *s)
         err = lights_median_cut(l, &scene->panorama, s->n_lights * s->n_sub);
     if (err)
         return err;
-    scene->group = calloc((size_t)l->n, sizeof(*scene->group));
-    if (!scene->group)
-        return -ENOMEM;
     for (int i = 0; i < l->n; i++) // aligned runs are the regions of the coarser cut
-        scene->group[i] = l->group[i] = i / s->n_sub;
+        l->group[i] = i / s->n_sub;
     for (int c = 0; c < 3; c++)
         l->centre_m[c] = (scene->mesh.bounds_m[0][c] + scene->mesh.bounds_m[1][c]) / 2;
     if (!s->world_from_probe) {
@@ -561,8 +556,8 @@ int command_solve(int argc, char **argv)
     int err = load(&scene, &s);
     const double stage_begin = wall_s();
     if (!err)
-        err = joint_solve(&result, &scene.texels, &scene.samples, scene.rays, &scene.lights, scene.group, s.n_lights,
-                          scene.held_out, &s.joint);
+        err = joint_solve(&result, &scene.texels, &scene.samples, scene.rays, &scene.lights, s.n_lights, scene.held_out,
+                          &s.joint);
     if (!err) {
         struct json *report = make_report(&scene, &s, &result, wall_s() - begin, wall_s() - stage_begin);
         err = write_result(&scene, &s, &result, report);
