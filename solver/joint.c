@@ -505,7 +505,7 @@ static int refine(struct stage1 *s, const uint8_t *fit)
         s->p.weight = weight;
     }
     if (!err)
-        err = minimise(s, s->set->method == METHOD_JOINT ? 8 : 40, s->set->method == METHOD_JOINT ? 1e-2 : 1e-5, NULL);
+        err = minimise(s, s->set->method == METHOD_JOINT ? 15 : 40, 1e-4, NULL);
     s->p.weight = NULL;
     free(weight);
     return err;
