@@ -11,7 +11,7 @@ BUILD := build$(if $(filter-out release,$(VARIANT)),/$(VARIANT))
 MACHINE := $(shell uname -m)
 
 # ---- packages (Debian 12; the same names in Debian 13) ----------------------------------------------------------------
-PACKAGES := gcc make pkg-config libopenexr-dev libembree-dev libassimp-dev libjansson-dev libtiff-dev libpng-dev libcmocka-dev perl help2man
+PACKAGES := gcc make pkg-config libopenexr-dev libembree-dev libassimp-dev libjansson-dev libtiff-dev libpng-dev liblapacke-dev libopenblas-dev libcmocka-dev perl help2man
 PACKAGES_FUZZ := clang libclang-rt-dev
 PACKAGES_BENCH := libceres-dev g++ gnuplot-nox
 
@@ -20,12 +20,11 @@ FLAGS_release := -O2 -g
 FLAGS_debug := -O0 -g3
 FLAGS_asan := -O1 -g -fsanitize=address,undefined -fno-sanitize-recover=undefined -fno-omit-frame-pointer
 FLAGS_tsan := -O1 -g -fsanitize=thread
-FLAGS_fuzz := -O1 -g -fsanitize=fuzzer-no-link,address,undefined -fno-sanitize-recover=undefined
 CFLAGS_ALL = -std=gnu11 -D_GNU_SOURCE $(FLAGS_$(VARIANT)) -Wall -Wextra -Wshadow -Wstrict-prototypes -fno-math-errno -fno-trapping-math \
   -ffp-contract=off -ffile-prefix-map=$(CURDIR)=. -pthread -I. -I/usr/include/OpenEXR -I/usr/include/Imath \
   -DSTUDIORIG_VERSION='"$(VERSION)"' $(CFLAGS)
 EMBREE = $(shell test -e /usr/include/embree4/rtcore.h && echo embree4 || echo embree3)
-LIBS = -lOpenEXRCore -l$(EMBREE) -lassimp -ljansson -ltiff -lpng -lm
+LIBS = -lOpenEXRCore -l$(EMBREE) -lassimp -ljansson -ltiff -lpng -llapacke -lopenblas -lm
 ifeq ($(MACHINE),x86_64)
 ISA_avx2 := -mavx2 -mfma
 ISA_avx512 := -mavx512f -mavx512dq -mavx512bw -mavx512vl -mfma -mprefer-vector-width=512
@@ -33,17 +32,18 @@ endif
 
 # ---- what is built ------------------------------------------------------------------------------------------------------
 TAKE := $(addprefix solver/take/,atomic_file.c image.c image_exr.c image_hdr.c image_png.c image_tiff.c json.c log.c progress.c take.c)
-SOLVER := $(addprefix solver/,cameras.c cameras_colmap.c compare.c csv.c disney.c lights.c mesh.c mesh_import.c panorama.c parallel.c \
-  rays.c render.c samples.c shapes.c synth.c texels.c visibility.c)
+SOLVER := $(addprefix solver/,cameras.c cameras_colmap.c compare.c csv.c disney.c joint.c lights.c lm.c mesh.c mesh_import.c \
+  normal_equations.c orientation.c panorama.c parallel.c pcg.c photometric.c rays.c render.c samples.c shapes.c synth.c \
+  texels.c visibility.c)
 KERNELS := $(addprefix solver/kernels/,kernels.c kernels_ref.c kernels_portable.c kernels_avx2.c kernels_avx512.c)
-COMMANDS := $(addprefix solver/commands/,brdf.c compare.c lights.c render.c synth.c visibility.c)
+COMMANDS := $(addprefix solver/commands/,brdf.c compare.c lights.c render.c solve.c synth.c visibility.c)
 LIBRARY := $(TAKE) $(SOLVER) $(KERNELS)
-TESTS := $(addprefix test_,brdf cameras compare csv disney image json lights mesh panorama parallel rays render samples shapes synth take texels vec3 visibility) check_kernels
+FUZZED := $(TAKE) $(filter-out %/render.c %/synth.c,$(SOLVER))
+TESTS := $(addprefix test_,brdf cameras compare csv disney image json lights lm mesh orientation panorama parallel rays render samples shapes synth take texels vec3 visibility) check_kernels
 FUZZERS := cameras csv exr hdr json lights mesh
 
 # ---- rules --------------------------------------------------------------------------------------------------------------
-have = $(wildcard $(1)) # files not written yet are left out
-object = $(patsubst %.c,$(BUILD)/obj/%.o,$(call have,$(1)))
+object = $(patsubst %.c,$(BUILD)/obj/%.o,$(1))
 ifneq ($(filter test demo bench chart stability,$(MAKECMDGOALS)),)
 FIRST := deps # these four install what is missing before the first file is compiled
 endif
@@ -76,10 +76,13 @@ $(BUILD)/tests/%: $(BUILD)/obj/tests/%.o $(BUILD)/libstudiorig.a
 	@mkdir -p $(@D)
 	@$(if $(V),,echo '  LD $@')
 	$(Q)$(CC) $(CFLAGS_ALL) $^ -lcmocka $(LIBS) -o $@
-$(BUILD)/fuzz/%: tests/fuzz/%.c $(call have,$(LIBRARY)) Makefile | deps-fuzz
+$(BUILD)/fuzz/obj/%.o: %.c Makefile | deps-fuzz
 	@mkdir -p $(@D)
-	@$(if $(V),,echo '  FUZZ $<')
-	$(Q)clang $(FUZZ_FLAGS) $< $(call have,$(FUZZED)) $(LIBS) -o $@
+	@$(if $(V),,echo '  CC (fuzz) $<')
+	$(Q)clang $(FUZZ_FLAGS) -MMD -MP -c $< -o $@
+$(BUILD)/fuzz/fuzz_%: $(BUILD)/fuzz/obj/tests/fuzz/fuzz_%.o $(patsubst %.c,$(BUILD)/fuzz/obj/%.o,$(FUZZED))
+	@$(if $(V),,echo '  LD (fuzz) $@')
+	$(Q)clang $(FUZZ_FLAGS) -fsanitize=fuzzer $^ $(LIBS) -o $@
 
 # dpkg-query knows what is there; apt-get is asked only for what is not.
 install_packages = @missing=$$(for p in $(1); do dpkg-query -W -f='$${Status}\n' $$p 2>/dev/null | grep -q 'ok installed' || echo $$p; done); \
@@ -93,17 +96,16 @@ deps-fuzz: ; $(call install_packages,$(PACKAGES_FUZZ))
 deps-bench: deps ; $(call install_packages,$(PACKAGES_BENCH))
 
 # ---- tests ----------------------------------------------------------------------------------------------------------------
-TEST_PROGRAMS := $(patsubst tests/%.c,$(BUILD)/tests/%,$(call have,$(addprefix tests/,$(addsuffix .c,$(TESTS)))))
+TEST_PROGRAMS := $(addprefix $(BUILD)/tests/,$(TESTS))
 test: deps $(BUILD)/bin/rigsolve $(TEST_PROGRAMS)
 	@CMOCKA_MESSAGE_OUTPUT=TAP BIN=$(BUILD)/bin prove --timer --merge --exec '' tests/check_includes.sh $(TEST_PROGRAMS) tests/test_commands.sh
 check-includes:
 	@prove --exec '' tests/check_includes.sh
 
 FUZZ_SECONDS ?= 60
-FUZZ_FLAGS = -std=gnu11 -D_GNU_SOURCE -O1 -g -fsanitize=fuzzer,address,undefined -fno-sanitize-recover=undefined -pthread -I. \
+FUZZ_FLAGS = -std=gnu11 -D_GNU_SOURCE -O1 -g -fsanitize=fuzzer-no-link,address,undefined -fno-sanitize-recover=undefined -pthread -I. \
   -I/usr/include/OpenEXR -I/usr/include/Imath -DSTUDIORIG_VERSION='"$(VERSION)"'
-FUZZED := $(TAKE) $(filter-out %/render.c %/synth.c,$(SOLVER))
-FUZZ_PROGRAMS := $(patsubst tests/%.c,$(BUILD)/%,$(call have,$(patsubst %,tests/fuzz/fuzz_%.c,$(FUZZERS))))
+FUZZ_PROGRAMS := $(addprefix $(BUILD)/fuzz/fuzz_,$(FUZZERS))
 fuzz: deps deps-fuzz $(FUZZ_PROGRAMS)
 	@printf '%s\n' $(FUZZ_PROGRAMS) | xargs -P 2 -I{} sh tests/fuzz/run.sh {} $(FUZZ_SECONDS)
 
@@ -147,4 +149,4 @@ help:
 	@echo 'make bench      seconds and errors of kernels     make chart     speed against accuracy      make stability  where it fails'
 	@echo 'make install    DESTDIR= PREFIX=/usr/local        make deps      Debian packages             make clean'
 	@echo 'variants: VARIANT=debug|asan|tsan; V=1 shows commands'
--include $(shell find $(BUILD)/obj -name '*.d' 2>/dev/null)
+-include $(shell find $(BUILD)/obj $(BUILD)/fuzz -name '*.d' 2>/dev/null)

@@ -12,6 +12,8 @@ enum disney_parameter {
 };
 extern const char *const disney_parameter_names[DISNEY_N]; // "metallic", ... as in the reference file
 
+enum reflectance { REFLECT_DISNEY, REFLECT_LAMBERT /* f = albedo / pi */ };
+
 enum disney_variant {
     DISNEY_2017, // G with the anisotropic alphas of D (the reference file since 2017); the default
     DISNEY_2012, // G isotropic, alpha_g = (.5 + .5 roughness)^2

@@ -4,6 +4,7 @@
 // Letters (paper, Eqs. 1-4): dh probe direction, C irradiance, c centre, R world_from_probe, and
 // q = 1/r. All others: NOTATION.md.
 #include "solver/lights.h"
+#include "solver/orientation.h"
 #include "solver/take/log.h"
 #include "solver/vec3.h"
 
@@ -322,33 +323,55 @@ no_memory:
 
 // ---- lights.json --------------------------------------------------------------------------------
 
-static const char format_name[] = "studiorig-lights-1";
+// What a number in a file may be. From distance_max_m on a light is directional: q (c - p) is below
+// rounding beside R dh.
+static const double length_max_m = 1e9, distance_min_m = 1e-6, distance_max_m = 1e15,
+                    irradiance_max = 1e30;
+// By how much what a file says twice may differ: six decimals of metres and directions suffice.
+static const double agree = 2e-6;
 
-static void light_position(const struct lights *l, int i, double pos_m[3]) // c + R dh / q
+static bool is_directional(double inverse_distance)
 {
-    double a[3];
-    mat3_mul_vec(a, l->world_from_probe, l->dir_probe[i]);
-    vec3_add_scaled(pos_m, l->centre_m, 1 / l->inverse_distance[i], a);
+    return inverse_distance * distance_max_m < 1;
 }
 
-static struct json *light_to_json(const struct lights *l, int i)
+// As lights_new() leaves it: nobody has said where these lights are in the world.
+static bool has_set_up(const struct lights *l)
+{
+    static const double identity[9] = {1, 0, 0, 0, 1, 0, 0, 0, 1};
+    for (int k = 0; k < 9; k++)
+        if (l->world_from_probe[k] != identity[k])
+            return true;
+    for (int i = 0; i < l->n; i++)
+        if (!is_directional(l->inverse_distance[i]))
+            return true;
+    return false;
+}
+
+static struct json *light_to_json(const struct lights *l, int i, bool with_world)
 {
     struct json *v = json_object();
     const double q = l->inverse_distance[i];
+    double dir_world[3], pos_m[3];
+    mat3_mul_vec(dir_world, l->world_from_probe, l->dir_probe[i]);
+    vec3_add_scaled(pos_m, l->centre_m, 1 / q, dir_world);
     json_set_numbers(v, "dir_probe", l->dir_probe[i], 3);
+    if (with_world)
+        json_set_numbers(v, "dir_world", dir_world, 3);
     json_set_numbers(v, "irradiance", l->irradiance[i], 3);
-    json_set_number(v, "distance_m", q > 0 ? 1 / q : NAN); // not finite: null
-    if (q > 0) {
-        double pos_m[3];
-        light_position(l, i, pos_m);
-        json_set_numbers(v, "pos_m", pos_m, 3);
-    } else {
+    if (is_directional(q)) {
+        json_set_number(v, "distance_m", NAN); // not finite: null
         json_set_number(v, "pos_m", NAN);
+    } else {
+        json_set_number(v, "distance_m", 1 / q);
+        json_set_numbers(v, "pos_m", pos_m, 3);
     }
     json_set_int(v, "group", l->group[i]);
     if (l->region) {
         const struct light_region *r = &l->region[i];
-        json_set_numbers(v, "region", (double[]){r->x0, r->y0, r->x1, r->y1}, 4);
+        json_set_numbers(v, "region_px", (double[]){r->x0, r->y0, r->x1, r->y1}, 4);
+        json_set_numbers(v, "panorama_px", (double[]){l->panorama_width_px, l->panorama_height_px},
+                         2);
     }
     if (l->spread_rad)
         json_set_number(v, "spread_rad", l->spread_rad[i]);
@@ -357,38 +380,38 @@ static struct json *light_to_json(const struct lights *l, int i)
 
 int lights_write_json(const struct lights *l, const char *path)
 {
-    struct json *doc = json_object(), *panorama = json_object(), *list = json_array();
-    json_set_string(doc, "format", format_name);
-    json_set_int(panorama, "width", l->panorama_width_px);
-    json_set_int(panorama, "height", l->panorama_height_px);
-    json_set(doc, "panorama", panorama);
-    json_set_numbers(doc, "centre_m", l->centre_m, 3);
-    json_set_matrix3(doc, "world_from_probe", l->world_from_probe);
+    struct json *list = json_array();
+    const bool with_world = has_set_up(l);
     for (int i = 0; i < l->n; i++)
-        json_append(list, light_to_json(l, i));
-    json_set(doc, "lights", list);
-    const int err = json_write(doc, path);
-    json_free(doc);
+        json_append(list, light_to_json(l, i, with_world));
+    const int err = json_write(list, path);
+    json_free(list);
     return err;
 }
 
-// What a number in a file may be: beyond this it is a mistake, and float kernels would overflow.
-static const double length_max_m = 1e9, distance_min_m = 1e-6, irradiance_max = 1e30;
+// The list of a file while it is read, and what struct lights has no place for.
+struct reading {
+    const struct json *list;
+    const char *file;
+    struct lights l;
+    double (*dir_world)[3]; // [n]; (0,0,0): not said
+    double (*pos_m)[3];     // [n]; of lights with a distance
+};
 
-// null is the one value that the readers of json.h cannot tell.
-static bool is_null(const struct json *doc, const char *key)
+// There, and not null, the one value that the readers of json.h cannot tell.
+static bool is_said(const struct reading *f, const char *key)
 {
-    const struct json *v = json_get(doc, key);
+    const struct json *v = json_get(f->list, key);
     char *text = v ? json_text(v) : NULL;
     const bool null = text && !strcmp(text, "null");
     free(text);
-    return null;
+    return v && !null;
 }
 
-static int refuse(const char *file, const struct json *doc, const char *key, const char *what)
+static int refuse(const struct reading *f, const char *key, const char *what)
 {
-    char *found = json_text(json_get(doc, key));
-    log_error("lights: %s: %s: found %.80s%s: %s", file, key, found ? found : "?",
+    char *found = json_text(json_get(f->list, key));
+    log_error("lights: %s: %s: found %.80s%s: %s", f->file, key, found ? found : "nothing",
               found && strlen(found) > 80 ? "..." : "", what);
     free(found);
     return -EINVAL;
@@ -397,177 +420,278 @@ static int refuse(const char *file, const struct json *doc, const char *key, con
 enum { KEY_MAX = 64 };
 static const char *light_key(char key[KEY_MAX], int i, const char *name)
 {
-    snprintf(key, KEY_MAX, "lights.%d.%s", i, name);
+    snprintf(key, KEY_MAX, "%d.%s", i, name);
     return key;
 }
 
-static int read_place(struct lights *l, const struct json *doc, const char *file)
-{
-    int err = json_require_numbers(doc, "centre_m", l->centre_m, 3, file);
-    if (!err)
-        err = json_require_numbers(doc, "world_from_probe", l->world_from_probe, 9, file);
-    if (err)
-        return err;
-    for (int k = 0; k < 3; k++)
-        if (!(fabs(l->centre_m[k]) <= length_max_m))
-            return refuse(file, doc, "centre_m", "more than 1e9 m away; expected metres");
-    const double *R = l->world_from_probe;
-    for (int i = 0; i < 3; i++)
-        for (int j = i; j < 3; j++)
-            if (!(fabs(vec3_dot(R + 3 * i, R + 3 * j) - (i == j)) <= 1e-6))
-                return refuse(file, doc, "world_from_probe",
-                              "not a rotation: its rows are not orthonormal to 1e-6");
-    if (mat3_det(R) < 0)
-        return refuse(file, doc, "world_from_probe",
-                      "is mirrored (determinant -1): expected a rotation; mirror the panorama, "
-                      "not the rotation");
-    return 0;
-}
-
-static int read_panorama_size(struct lights *l, const struct json *doc, const char *file)
-{
-    int64_t width = 0, height = 0;
-    if (!json_get(doc, "panorama") || is_null(doc, "panorama"))
-        return 0;
-    if (json_get_int(doc, "panorama.width", &width) ||
-        json_get_int(doc, "panorama.height", &height) || width < 0 || width > 65536 ||
-        width != 2 * height)
-        return refuse(file, doc, "panorama",
-                      "expected integers width = 2 x height, at most 65536 (0: no panorama)");
-    l->panorama_width_px = (int)width, l->panorama_height_px = (int)height;
-    return 0;
-}
-
-static int read_distance(struct lights *l, int i, const struct json *doc, const char *file)
+static int read_direction(struct reading *f, int i, const char *name, double dir[3])
 {
     char key[KEY_MAX];
-    double distance_m, pos_m[3], expected[3];
-    light_key(key, i, "distance_m");
-    if (is_null(doc, key))
-        return 0; // directional, as lights_new() left it
-    const int err = json_require_numbers(doc, key, &distance_m, 1, file);
-    if (err)
-        return err;
-    if (!(distance_m >= distance_min_m))
-        return refuse(file, doc, key,
-                      "below 1e-6 m; expected metres, or null for a directional light");
-    l->inverse_distance[i] = 1 / distance_m;
-
-    // It says again what centre, rotation, direction and distance say: an edit must be of both.
-    light_key(key, i, "pos_m");
-    if (!json_get(doc, key) || is_null(doc, key))
-        return 0;
-    const int pos_err = json_require_numbers(doc, key, pos_m, 3, file);
-    if (pos_err)
-        return pos_err;
-    light_position(l, i, expected);
-    vec3_sub(pos_m, pos_m, expected);
-    if (!(vec3_norm(pos_m) <= 1e-5 * (distance_m + vec3_norm(l->centre_m) + 1)))
-        return refuse(file, doc, key,
-                      "is not centre_m + distance_m x world_from_probe x dir_probe: correct it, or "
-                      "leave it out");
-    return 0;
-}
-
-static int read_light(struct lights *l, int i, const struct json *doc, const char *file)
-{
-    char key[KEY_MAX];
-    double *dir = l->dir_probe[i];
-    int err = json_require_numbers(doc, light_key(key, i, "dir_probe"), dir, 3, file);
+    const int err = json_require_numbers(f->list, light_key(key, i, name), dir, 3, f->file);
     if (err)
         return err;
     const double length = vec3_norm(dir);
     if (!(fabs(length - 1) <= 1e-6))
-        return refuse(file, doc, key, "not a unit vector (to 1e-6)");
+        return refuse(f, key, "not a unit vector (to 1e-6)");
     if (fabs(length - 1) > 1e-15) // else it is one to rounding: keep every bit
         vec3_normalise(dir);
+    return 0;
+}
 
-    err = json_require_numbers(doc, light_key(key, i, "irradiance"), l->irradiance[i], 3, file);
+static int read_place(struct reading *f, int i)
+{
+    char distance_key[KEY_MAX], key[KEY_MAX];
+    double distance_m, *pos_m = f->pos_m[i];
+    light_key(distance_key, i, "distance_m");
+    light_key(key, i, "pos_m");
+    if (json_get(f->list, distance_key) && !is_said(f, distance_key)) {
+        if (is_said(f, key))
+            return refuse(f, key, "a directional light (distance_m null) has none: expected null");
+        return 0; // directional, as lights_new() left it
+    }
+    int err = json_require_numbers(f->list, distance_key, &distance_m, 1, f->file);
+    if (err)
+        return err;
+    if (!(distance_m >= distance_min_m && distance_m <= distance_max_m))
+        return refuse(f, distance_key,
+                      "outside [1e-6, 1e15] m; expected metres, or null for a directional light");
+    f->l.inverse_distance[i] = 1 / distance_m;
+    err = json_require_numbers(f->list, key, pos_m, 3, f->file);
+    if (err)
+        return err;
+    for (int k = 0; k < 3; k++)
+        if (!(fabs(pos_m[k]) <= distance_m + length_max_m))
+            return refuse(f, key, "more than 1e9 m further away than distance_m; expected metres");
+    return 0;
+}
+
+static int read_region(struct reading *f, int i)
+{
+    char key[KEY_MAX];
+    double size[2], edge[4]; // x0, y0, x1, y1
+    struct lights *l = &f->l;
+    light_key(key, i, "panorama_px");
+    int err = json_require_numbers(f->list, key, size, 2, f->file);
+    if (err)
+        return err;
+    if (!(size[0] >= 2 && size[0] <= 65536 && size[0] == 2 * size[1] && size[1] == floor(size[1])))
+        return refuse(f, key, "expected [width, height], integers, width = 2 x height <= 65536");
+    if (i > 0 && size[0] != l->panorama_width_px)
+        return refuse(f, key, "is not that of the lights before: expected one panorama");
+    l->panorama_width_px = (int)size[0], l->panorama_height_px = (int)size[1];
+    err = json_require_numbers(f->list, light_key(key, i, "region_px"), edge, 4, f->file);
+    if (err)
+        return err;
+    for (int k = 0; k < 4; k++)
+        if (!(edge[k] >= 0 && edge[k] <= size[k % 2] && edge[k] == floor(edge[k])) ||
+            edge[k] < edge[k % 2])
+            return refuse(f, key,
+                          "must be pixels x0, y0, x1, y1 inside the panorama, x0 <= x1, y0 <= y1");
+    l->region[i] = (struct light_region){(int)edge[0], (int)edge[1], (int)edge[2], (int)edge[3]};
+    return 0;
+}
+
+static int read_light(struct reading *f, int i)
+{
+    char key[KEY_MAX];
+    struct lights *l = &f->l;
+    int err = read_direction(f, i, "dir_probe", l->dir_probe[i]);
+    if (!err && is_said(f, light_key(key, i, "dir_world")))
+        err = read_direction(f, i, "dir_world", f->dir_world[i]);
+    if (!err)
+        err = json_require_numbers(f->list, light_key(key, i, "irradiance"), l->irradiance[i], 3,
+                                   f->file);
     if (err)
         return err;
     for (int c = 0; c < 3; c++)
         if (!(l->irradiance[i][c] >= 0 && l->irradiance[i][c] <= irradiance_max))
-            return refuse(file, doc, key, "a channel is outside [0, 1e30]");
-    err = read_distance(l, i, doc, file);
+            return refuse(f, key, "a channel is outside [0, 1e30]");
+    err = read_place(f, i);
     if (err)
         return err;
 
     int64_t group = -1;
-    light_key(key, i, "group");
-    if (json_get(doc, key) && !is_null(doc, key) &&
-        (json_get_int(doc, key, &group) || group < -1 || group >= l->n))
-        return refuse(file, doc, key,
-                      "must be the number of an emitter (0 .. lights - 1), or -1 for none");
+    if (is_said(f, light_key(key, i, "group")) &&
+        (json_get_int(f->list, key, &group) || group < -1 || group >= l->n))
+        return refuse(f, key, "must be the number of an emitter (0 .. lights - 1), or -1 for none");
     l->group[i] = (int32_t)group;
 
-    if (l->region) {
-        double edge[4]; // x0, y0, x1, y1
-        const double limit[4] = {l->panorama_width_px, l->panorama_height_px, l->panorama_width_px,
-                                 l->panorama_height_px};
-        err = json_require_numbers(doc, light_key(key, i, "region"), edge, 4, file);
+    if (l->region)
+        err = read_region(f, i);
+    if (err || !l->spread_rad)
+        return err;
+    err = json_require_numbers(f->list, light_key(key, i, "spread_rad"), &l->spread_rad[i], 1,
+                               f->file);
+    if (!err && !(l->spread_rad[i] >= 0 && l->spread_rad[i] <= M_PI))
+        return refuse(f, key, "outside [0, pi]");
+    return err;
+}
+
+// ---- the set-up, from lights in both frames -----------------------------------------------------
+
+struct means { // over the lights with a distance, weighted: of r dh and of pos_m
+    double probe_m[3], world_m[3];
+};
+
+// Places weigh 1/r^2, so that each counts as a direction does: a light a kilometre away must not
+// blur where those beside it stand.
+static struct means weighted_means(const struct reading *f)
+{
+    struct means m = {{0}, {0}};
+    double sum = 0;
+    for (int i = 0; i < f->l.n; i++) {
+        const double q = f->l.inverse_distance[i];
+        vec3_add_scaled(m.probe_m, m.probe_m, q, f->l.dir_probe[i]); // q^2 r
+        vec3_add_scaled(m.world_m, m.world_m, q * q, f->pos_m[i]);
+        sum += q * q;
+    }
+    for (int k = 0; k < 3 && sum > 0; k++)
+        m.probe_m[k] /= sum, m.world_m[k] /= sum;
+    return m;
+}
+
+static int fit_places(struct orientation *fit, const struct reading *f, const struct means *m)
+{
+    const int n = f->l.n;
+    double(*a)[3] = calloc(2 * (size_t)n, sizeof(*a)), (*b)[3] = a ? a + n : NULL;
+    double *weight = calloc((size_t)n, sizeof(*weight));
+    if (!a || !weight) {
+        free(a);
+        free(weight);
+        return -ENOMEM;
+    }
+    for (int i = 0; i < n; i++) {
+        const double q = f->l.inverse_distance[i];
+        if (q <= 0)
+            continue;
+        for (int k = 0; k < 3; k++)
+            a[i][k] = f->l.dir_probe[i][k] / q - m->probe_m[k];
+        vec3_sub(b[i], f->pos_m[i], m->world_m);
+        weight[i] = q * q;
+    }
+    orientation_fit(fit, a, b, weight, n);
+    free(a);
+    free(weight);
+    return 0;
+}
+
+static int find_rotation(struct reading *f, struct orientation *fit, const struct means *m)
+{
+    const int n = f->l.n;
+    int n_turned = 0, n_placed = 0;
+    for (int i = 0; i < n; i++) {
+        n_turned += vec3_dot(f->dir_world[i], f->dir_world[i]) > 0;
+        n_placed += f->l.inverse_distance[i] > 0;
+    }
+    memset(fit, 0, sizeof(*fit));
+    memcpy(fit->rotation, f->l.world_from_probe, sizeof(fit->rotation));
+    if (n_turned == n) {
+        orientation_fit(fit, f->l.dir_probe, f->dir_world, NULL, n);
+    } else if (n_turned || n_placed) {
+        const int err = fit_places(fit, f, m);
         if (err)
             return err;
-        for (int k = 0; k < 4; k++)
-            if (!(edge[k] >= 0 && edge[k] <= limit[k] && edge[k] == floor(edge[k])) ||
-                edge[k] < edge[k % 2])
-                return refuse(
-                    file, doc, key,
-                    "must be pixels x0, y0, x1, y1 inside the panorama, x0 <= x1, y0 <= y1");
-        l->region[i] =
-            (struct light_region){(int)edge[0], (int)edge[1], (int)edge[2], (int)edge[3]};
+        if (!fit->determined) {
+            log_error("lights: %s: what turns the probe's axes into the world's cannot be told: "
+                      "dir_world is with %d of %d lights, and the places of the %d with distance_m "
+                      "and pos_m lie on one line: give every light its dir_world, or place three "
+                      "lights that do not",
+                      f->file, n_turned, n, n_placed);
+            return -EINVAL;
+        }
+    } else {
+        log_info("lights: %s: no light has a dir_world, a distance_m and a pos_m: the probe's axes "
+                 "are taken for the world's",
+                 f->file);
     }
-    if (l->spread_rad) {
-        err =
-            json_require_numbers(doc, light_key(key, i, "spread_rad"), &l->spread_rad[i], 1, file);
-        if (err)
-            return err;
-        if (!(l->spread_rad[i] >= 0 && l->spread_rad[i] <= M_PI))
-            return refuse(file, doc, key, "outside [0, pi]");
+    return 0;
+}
+
+static int find_set_up(struct reading *f)
+{
+    struct lights *l = &f->l;
+    struct orientation fit;
+    const struct means m = weighted_means(f);
+    int err = find_rotation(f, &fit, &m);
+    if (err)
+        return err;
+    memcpy(l->world_from_probe, fit.rotation, sizeof(fit.rotation));
+    mat3_mul_vec(l->centre_m, fit.rotation, m.probe_m);
+    vec3_sub(l->centre_m, m.world_m, l->centre_m);
+
+    // The light that fits least, of those that do not: least squares spread its error over others.
+    const double from_origin_m = vec3_norm(l->centre_m);
+    double most = agree;
+    char key[KEY_MAX] = "";
+    for (int i = 0; i < l->n; i++) {
+        const double q = l->inverse_distance[i];
+        double dir[3], off[3];
+        mat3_mul_vec(dir, l->world_from_probe, l->dir_probe[i]);
+        vec3_sub(off, f->dir_world[i], dir);
+        if (vec3_dot(f->dir_world[i], f->dir_world[i]) > 0 && vec3_norm(off) > most) {
+            most = vec3_norm(off);
+            light_key(key, i, "dir_world");
+        }
+        if (q <= 0)
+            continue;
+        vec3_add_scaled(off, l->centre_m, 1 / q, dir);
+        vec3_sub(off, off, f->pos_m[i]);
+        const double relative = vec3_norm(off) / (1 + 1 / q + from_origin_m);
+        if (relative > most) {
+            most = relative;
+            light_key(key, i, "pos_m");
+        }
     }
+    if (*key)
+        return refuse(f, key,
+                      fit.mirrored ? "the lights are mirrored: no rotation takes dir_probe to the "
+                                     "world, a reflection fits better; is one axis the wrong way?"
+                                   : "does not fit: one rotation and one centre must take every "
+                                     "light's dir_probe to its dir_world, and distance_m along it "
+                                     "to its pos_m");
+    for (int k = 0; k < 3; k++)
+        if (!(fabs(l->centre_m[k]) <= length_max_m)) {
+            log_error("lights: %s: distance_m and pos_m put the probe at (%g, %g, %g), more than "
+                      "1e9 m away; expected metres",
+                      f->file, l->centre_m[0], l->centre_m[1], l->centre_m[2]);
+            return -EINVAL;
+        }
     return 0;
 }
 
 static int from_json(struct lights *out, const struct json *doc, const char *file)
 {
-    struct lights l = {0};
-    const char *format;
-    int err = json_require_string(doc, "format", &format, file);
-    if (err)
-        goto fail;
-    if (strcmp(format, format_name)) {
-        err = refuse(file, doc, "format", "expected \"studiorig-lights-1\"");
-        goto fail;
-    }
-    const int n = json_length(doc, "lights");
+    struct reading f = {.list = json_get(doc, "lights"), .file = file};
+    f.list = f.list ? f.list : doc; // a wrapped list, or the list
+    const int n = json_length(f.list, "");
     if (n < 1 || n > LIGHTS_MAX) {
-        log_error("lights: %s: lights: expected a list of 1 to %d lights, found %s", file,
-                  LIGHTS_MAX,
+        log_error("lights: %s: expected a list of 1 to %d lights, found %s", file, LIGHTS_MAX,
                   n > 0    ? "more"
                   : n == 0 ? "none"
                            : "no list");
-        err = -EINVAL;
-        goto fail;
+        return -EINVAL;
     }
-    err = lights_new(&l, n);
+    const bool regions = json_get(f.list, "0.region_px"),
+               spreads = json_get(f.list, "0.spread_rad");
+    int err = lights_new(&f.l, n);
     if (err)
-        goto fail;
-    const bool regions = json_get(doc, "lights.0.region"),
-               spreads = json_get(doc, "lights.0.spread_rad");
-    l.region = regions ? calloc((size_t)n, sizeof(*l.region)) : NULL;
-    l.spread_rad = spreads ? calloc((size_t)n, sizeof(*l.spread_rad)) : NULL;
-    err = (regions && !l.region) || (spreads && !l.spread_rad) ? -ENOMEM : 0;
-    if (!err)
-        err = read_place(&l, doc, file);
-    if (!err)
-        err = read_panorama_size(&l, doc, file);
+        return err;
+    f.l.region = regions ? calloc((size_t)n, sizeof(*f.l.region)) : NULL;
+    f.l.spread_rad = spreads ? calloc((size_t)n, sizeof(*f.l.spread_rad)) : NULL;
+    f.dir_world = calloc((size_t)n, sizeof(*f.dir_world));
+    f.pos_m = calloc((size_t)n, sizeof(*f.pos_m));
+    if (!f.dir_world || !f.pos_m || (regions && !f.l.region) || (spreads && !f.l.spread_rad))
+        err = -ENOMEM;
     for (int i = 0; i < n && !err; i++)
-        err = read_light(&l, i, doc, file);
+        err = read_light(&f, i);
+    if (!err)
+        err = find_set_up(&f);
+    free(f.dir_world);
+    free(f.pos_m);
     if (err)
-        goto fail;
-    *out = l;
-    return 0;
-fail:
-    lights_free(&l);
+        lights_free(&f.l);
+    else
+        *out = f.l;
     // A missing key is a broken file; -ENOENT would say that there is no file.
     return err == -ENOENT ? -EINVAL : err;
 }

@@ -37,11 +37,20 @@ void lights_free(struct lights *l); // leaves it zeroed
 // the cut into n / 2^j, so neighbours in the list are neighbours in the sky. 0, -EINVAL (n; logged), -ENOMEM.
 int lights_median_cut(struct lights *out, const struct panorama *p, int n);
 
-// lights.json (DESIGN.md 6): {format: "studiorig-lights-1", panorama: {width, height} (optional), centre_m, world_from_probe,
-// lights: [{dir_probe, irradiance, distance_m (null = directional), pos_m (optional; agrees with the rest), group (-1: none),
-// region: [x0, y0, x1, y1], spread_rad (both optional, but of all lights or none)}]}.
-// Every bit survives a round trip, but for the last one of 1/r. Reading checks ranges: directions unit and the rotation
-// orthonormal to 1e-6, irradiance in [0, 1e30]. Errors are logged: -EINVAL, -ENOMEM, those of json_read.
+// lights.json (DESIGN.md 6): a list of {dir_probe[3], dir_world[3] (= R dh), irradiance[3], distance_m and pos_m[3]
+// (both null: directional), group (-1: none), and from a panorama region_px[4] (x0, y0, x1, y1), panorama_px[2] (width, height)
+// and spread_rad}. Lights without a set-up (lights_new: R identity, all directional) are written without dir_world.
+//
+// The set-up is not in the file; it is what takes dir_probe to dir_world and pos_m:
+// - R from dir_world where every light has one; else from the lights with a distance, of which three must not lie on one line;
+//   else R = identity, which is logged. Of lights in one direction, or none: the smallest rotation that fits.
+// - c = mean of pos_m - r R dh, each weighted by 1/r^2; 0 where all are directional.
+// What was written comes back: dir_probe, irradiance, group, region and spread to the bit, 1/r to its last one, R and c
+// to rounding (c: of the distances) where the lights determine them, R dh in any case. Beyond 1e15 m a light is directional.
+// Reading accepts a missing group, and the list wrapped as {"lights": list, ...}; other keys are not looked at; region_px and
+// spread_rad are of all lights or none. It checks: directions unit to 1e-6, irradiance in [0, 1e30], that all lights agree with
+// R and c (2e-6: six decimals suffice) and are not mirrored. Errors are logged and name light (from 0) and key: -EINVAL, -ENOMEM,
+// those of json_read.
 int lights_write_json(const struct lights *l, const char *path);
 int lights_read_json(struct lights *out, const char *path);
 int lights_parse_json(struct lights *out, const char *text, size_t n_bytes, const char *name_for_errors);

@@ -7,8 +7,6 @@
 #include "solver/rays.h"
 #include "solver/take/image.h"
 
-enum reflectance { REFLECT_DISNEY, REFLECT_LAMBERT };
-
 // A material: textures over the mesh's atlas, or constants where a texture is NULL.
 struct render_material {
     enum reflectance model;

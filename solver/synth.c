@@ -755,13 +755,14 @@ static int prepare(struct job *job)
     for (int k = 0; k < 3; k++)
         job->object_m[k] = middle_m[k] + (s->data_set == 1 ? 0 : off_centre_m[k]);
     true_rotation(s->seed, job->world_from_probe);
-    job->render = (struct render_settings){.samples = s->samples,
-                                           .shadows = s->data_set >= 4,
-                                           .shadow_rays = SHADOW_RAYS,
-                                           .bounce_rays = s->data_set == 4 ? BOUNCE_RAYS : 0,
-                                           .bounce_texture = BOUNCE_TEXTURE,
-                                           .seed = s->seed,
-                                           .n_threads = s->n_threads};
+    job->render = (struct render_settings){
+        .samples = s->samples,
+        .shadows = s->data_set >= 4,
+        .shadow_rays = SHADOW_RAYS,
+        .bounce_rays = s->data_set == 4 ? BOUNCE_RAYS : 0,
+        .bounce_texture = s->texture_size < BOUNCE_TEXTURE ? s->texture_size : BOUNCE_TEXTURE,
+        .seed = s->seed,
+        .n_threads = s->n_threads};
     int err = shape_make(&job->mesh, shape, job->object_m, object_radius_m,
                          shape == SHAPE_PEBBLE ? 40000 : 80000);
     if (!err)

@@ -1,9 +1,9 @@
 // solver/synth.h - synthetic studios D1-D5 (SOLVER.md 5): takes with a known answer.
 //
-// Light comes from N^ point lights on the walls of a 3.6 x 2.4 x 1.2 m cuboid (middle at (0, 0, 1.2),
-// Z up), one per cell of an area-uniform jittered grid: four bright panels (9% of the area, 60 x the
-// radiance of the dim walls, slightly tinted). A light's direction from the true centre c is that of
-// a panorama pixel's centre, so panorama and lights say exactly the same;
+// Light comes from N^ point lights on the walls of a 3.6 x 2.4 x 1.2 m cuboid (middle at
+// (0, 0, 1.2), Z up), one per cell of an area-uniform jittered grid: four bright panels (9% of the
+// area, 60 x the radiance of the dim walls, slightly tinted). A light's direction from the true
+// centre c is that of a panorama pixel's centre, so panorama and lights say exactly the same;
 //   C_i = radiance x cell area x cosine at the wall / r^2,
 // scaled so that a sphere of albedo .5 at c is .25 bright on average. c is the cuboid's middle; the
 // object's bounding box is centred at c in D1, at c + (.35, .25, -.1) m in the others. The true
@@ -16,9 +16,9 @@
 // Noise is Gaussian, added to every pixel before the camera clips at 1; negative values are kept.
 // "clip" is 1 where it clipped.
 //
-// Writes a take (take.h) that a solver may read; truth/ which it never may; and relit/: 6 more views
-// under other panels with their panorama, probe, lights and panels, for judging. truth/ has the
-// layout of a solve, so `rigsolve render` takes it.
+// Writes a take (take.h) that a solver may read; truth/ which it never may; and relit/: 6 more
+// views under other panels with their panorama, probe, lights and panels, for judging. truth/ has
+// the layout of a solve, so `rigsolve render` takes it.
 #pragma once
 #include <stdbool.h>
 #include <stdint.h>

@@ -61,7 +61,7 @@ gives 1 "synth does not write into a folder that has something" "$rigsolve" synt
 gives 2 "synth names a data set it does not know" "$rigsolve" synth D9 -o "$dir/refused"
 
 gives 0 "lights" "$rigsolve" lights "$dir/one/panorama.exr" -n 64 -o "$dir/lights.json" --overlay "$dir/lights.png"
-json_has "$dir/lights.json" '@{$d->{lights}} == 64 && @{$d->{lights}[0]{irradiance}} == 3'
+json_has "$dir/lights.json" 'ref $d eq "ARRAY" && @$d == 64 && @{$d->[0]{irradiance}} == 3'
 result $? "lights.json lists 64 lights"
 gives 2 "lights refuses a count that is no power of two" "$rigsolve" lights "$dir/one/panorama.exr" -n 100 -o "$dir/refused"
 gives 0 "visibility of a take" "$rigsolve" visibility "$dir/one" -o "$dir/vis" --texture 64 --lights 64

@@ -21,6 +21,9 @@
 
 enum { SEED = 7 };
 
+// cmocka's assert_float_equal compares floats, whatever it is given.
+#define assert_near(a, b, bound) assert_true(fabs((a) - (b)) <= (bound))
+
 static char last_error[1024]; // what was logged
 
 static void remember(void *arg, enum log_level level, const char *message)
@@ -150,8 +153,8 @@ static void near_light_is_the_papers_equations_with_r(void **state)
         const double distance = vec3_normalise(to);
         const double weight = r * r / (distance * distance) * fmax(vec3_dot(to, l_d), 0);
         for (int k = 0; k < 3; k++)
-            assert_float_equal(at.l[k], to[k], 1e-13);
-        assert_float_equal(at.weight, weight, 1e-12 * (1 + weight));
+            assert_near(at.l[k], to[k], 1e-13);
+        assert_near(at.weight, weight, 1e-12 * (1 + weight));
     }
     lights_free(&l);
 }
@@ -163,7 +166,7 @@ static void at_the_centre_a_light_gives_its_own_irradiance(void **state)
     for (int i = 0; i < l.n; i++) {
         struct light_at at;
         light_at_point(&l, i, l.centre_m, &at);
-        assert_float_equal(at.weight, 1, 1e-14);
+        assert_near(at.weight, 1, 1e-14);
     }
     lights_free(&l);
 }
@@ -178,13 +181,13 @@ static void far_lights_become_directional(void **state)
         struct light_at at, directional;
         l.inverse_distance[i] = 0;
         light_at_point(&l, i, p, &directional);
-        assert_float_equal(directional.weight, 1, 1e-14);
+        assert_near(directional.weight, 1, 1e-14);
         l.inverse_distance[i] = 1e-9;
         light_at_point(&l, i, p, &at);
-        assert_float_equal(at.weight, 1, 3e-9);
+        assert_near(at.weight, 1, 3e-9);
         assert_true(at.weight != directional.weight); // and yet it is not ignored
         for (int k = 0; k < 3; k++)
-            assert_float_equal(at.l[k], directional.l[k], 1e-9);
+            assert_near(at.l[k], directional.l[k], 1e-9);
     }
     lights_free(&l);
 }
@@ -203,7 +206,7 @@ static void behind_and_at_a_light_there_is_no_light(void **state)
             struct light_at_gradient g;
             vec3_add_scaled(p, l.centre_m, (1 + .5 * k) / l.inverse_distance[i], l_d);
             light_at_point_gradient(&l, i, p, &g);
-            assert_float_equal(vec3_norm(g.at.l), 1, 1e-12);
+            assert_near(vec3_norm(g.at.l), 1, 1e-12);
             assert_true(g.at.weight == 0 ||
                         k == 0); // at the light: to rounding, which may leave it just in front
             memset(&g.at, 0, sizeof(g.at));
@@ -286,7 +289,7 @@ static void regions_partition_the_panorama_and_keep_its_energy(void **state)
         assert_memory_equal(l.irradiance, again.irradiance, (size_t)n * sizeof(*l.irradiance));
         assert_memory_equal(l.region, again.region, (size_t)n * sizeof(*l.region));
         for (int i = 0; i < n; i++)
-            assert_float_equal(vec3_norm(l.dir_probe[i]), 1, 1e-14);
+            assert_near(vec3_norm(l.dir_probe[i]), 1, 1e-14);
         lights_free(&l);
         lights_free(&again);
     }
@@ -358,14 +361,14 @@ static void lone_bright_pixels_on_black_get_one_light_each(void **state)
     assert_int_equal(lights_median_cut(&l, &p, N), 0);
     for (int i = 0; i < N; i++) {
         double x, y, d[3];
-        assert_float_equal(l.irradiance[i][1], 1, 1e-6);
+        assert_near(l.irradiance[i][1], 1, 1e-6);
         assert_true(l.irradiance[i][0] == 0 && l.irradiance[i][2] == 0);
         panorama_pixel(128, 64, l.dir_probe[i], &x, &y);
         assert_true(p.image.data[3 * ((int)y * 128 + (int)x) + 1] > 0);
         panorama_direction(128, 64, (int)x + .5, (int)y + .5, d);
         for (int k = 0; k < 3; k++)
-            assert_float_equal(l.dir_probe[i][k], d[k], 1e-14);
-        assert_float_equal(l.spread_rad[i], 0, 1e-7);
+            assert_near(l.dir_probe[i][k], d[k], 1e-14);
+        assert_near(l.spread_rad[i], 0, 1e-7);
     }
     lights_free(&l);
     panorama_free(&p);
@@ -409,9 +412,9 @@ static void direction_and_spread_are_energy_weighted(void **state)
         mean[k] = a[k] + 3 * b[k];
     vec3_normalise(mean);
     for (int k = 0; k < 3; k++)
-        assert_float_equal(l.dir_probe[0][k], mean[k], 1e-14);
+        assert_near(l.dir_probe[0][k], mean[k], 1e-14);
     const double to_a = acos(vec3_dot(a, mean)), to_b = acos(vec3_dot(b, mean));
-    assert_float_equal(l.spread_rad[0], sqrt((to_a * to_a + 3 * to_b * to_b) / 4), 1e-9);
+    assert_near(l.spread_rad[0], sqrt((to_a * to_a + 3 * to_b * to_b) / 4), 1e-9);
     lights_free(&l);
     panorama_free(&p);
 }
@@ -428,7 +431,7 @@ static void what_cannot_be_split_gives_empty_lights(void **state)
     for (int i = 0; i < 64; i++) {
         const bool none = l.region[i].x0 == l.region[i].x1;
         n_empty += none;
-        assert_float_equal(vec3_norm(l.dir_probe[i]), 1, 1e-14);
+        assert_near(vec3_norm(l.dir_probe[i]), 1, 1e-14);
         if (none)
             assert_true(l.irradiance[i][0] == 0 && l.spread_rad[i] == 0);
     }
@@ -499,154 +502,351 @@ static const char *in_folder(const char *name)
     return path[turn];
 }
 
-static char *text_of(const char *path, size_t *n)
+// A set-up anywhere in a hall. What of its lights: 0 all have distances, 1 every third, 2 none,
+// 3 all in one direction or against it, all with distances.
+enum { N_KINDS = 4, ON_A_LINE = 3 };
+static struct lights random_set_up(int n, int kind, int trial)
 {
-    FILE *f = fopen(path, "rb");
-    assert_non_null(f);
-    char *text = malloc(1 << 20);
-    assert_non_null(text);
-    *n = fread(text, 1, 1 << 20, f);
-    fclose(f);
-    return text;
+    struct lights l;
+    double w[3];
+    assert_int_equal(lights_new(&l, n), 0);
+    random_unit(w, 10, (uint64_t)trial);
+    for (int k = 0; k < 3; k++) {
+        w[k] *= 3 * random_uniform(SEED, 11, (uint64_t)trial);
+        l.centre_m[k] = kind == 2 ? 0 : 10 * random_uniform(SEED, 12, (uint64_t)(3 * trial + k));
+    }
+    mat3_from_rotation_vector(l.world_from_probe, w);
+    for (int i = 0; i < n; i++) {
+        const uint64_t at = (uint64_t)trial * LIGHTS_MAX + (uint64_t)i;
+        random_unit(l.dir_probe[i], 13, at);
+        for (int k = 0; k < 3; k++) {
+            l.irradiance[i][k] = exp(10 * random_normal(SEED, 14, 3 * at + (uint64_t)k));
+            if (kind == ON_A_LINE)
+                l.dir_probe[i][k] = (i % 2 ? -1 : 1) * l.dir_probe[0][k];
+        }
+        if (kind == 0 || kind == ON_A_LINE || (kind == 1 && i % 3 == 0))
+            l.inverse_distance[i] = .1 + 2 * random_uniform(SEED, 15, at);
+        l.group[i] = (int32_t)(random_u64(SEED, 16, at) % (uint64_t)(n + 1)) - 1;
+    }
+    return l;
 }
 
-static void lights_survive_a_file_bit_for_bit(void **state)
+static void assert_same_bits(const struct lights *a, const struct lights *b)
+{
+    const size_t n = (size_t)a->n;
+    assert_int_equal(a->n, b->n);
+    assert_memory_equal(a->dir_probe, b->dir_probe, n * sizeof(*a->dir_probe));
+    assert_memory_equal(a->irradiance, b->irradiance, n * sizeof(*a->irradiance));
+    assert_memory_equal(a->group, b->group, n * sizeof(*a->group));
+    assert_int_equal(a->panorama_width_px, b->panorama_width_px);
+    assert_int_equal(a->panorama_height_px, b->panorama_height_px);
+    assert_true(!a->region == !b->region && !a->spread_rad == !b->spread_rad);
+    if (a->region)
+        assert_memory_equal(a->region, b->region, n * sizeof(*a->region));
+    if (a->spread_rad)
+        assert_memory_equal(a->spread_rad, b->spread_rad, n * sizeof(double));
+}
+
+struct worst {
+    double centre_m, rotation, dir_world, inverse_distance;
+};
+
+static void compare_set_ups(struct worst *w, const struct lights *a, const struct lights *b)
+{
+    for (int k = 0; k < 3; k++)
+        w->centre_m = fmax(w->centre_m, fabs(a->centre_m[k] - b->centre_m[k]));
+    for (int k = 0; k < 9; k++)
+        w->rotation = fmax(w->rotation, fabs(a->world_from_probe[k] - b->world_from_probe[k]));
+    for (int i = 0; i < a->n; i++) {
+        const double q = a->inverse_distance[i];
+        double d[3], e[3];
+        mat3_mul_vec(d, a->world_from_probe, a->dir_probe[i]);
+        mat3_mul_vec(e, b->world_from_probe, b->dir_probe[i]);
+        vec3_sub(d, d, e);
+        w->dir_world = fmax(w->dir_world, vec3_norm(d));
+        assert_int_equal(q > 0, b->inverse_distance[i] > 0);
+        if (q > 0)
+            w->inverse_distance = fmax(w->inverse_distance, fabs(b->inverse_distance[i] - q) / q);
+    }
+}
+
+// Written, read, written and read again.
+static void through_files(struct worst *w, const struct lights *l)
+{
+    struct lights back, third;
+    const char *path = in_folder("lights.json");
+    assert_int_equal(lights_write_json(l, path), 0);
+    assert_int_equal(lights_read_json(&back, path), 0);
+    assert_int_equal(lights_write_json(&back, path), 0);
+    assert_int_equal(lights_read_json(&third, path), 0);
+    unlink(path);
+    assert_same_bits(l, &back);
+    assert_same_bits(l, &third);
+    compare_set_ups(w, l, &back);
+    compare_set_ups(w, l, &third);
+    lights_free(&back);
+    lights_free(&third);
+}
+
+static void set_ups_come_back_from_a_file_to_rounding(void **state)
+{
+    (void)state;
+    struct worst w = {0}, any_turn = {0};
+    log_set_level(LOG_ERROR);
+    for (int trial = 0; trial < 200; trial++) {
+        const int n = trial % 10 ? 4 + trial : 1 + trial / 10 % 3, kind = trial / 2 % N_KINDS;
+        struct lights l = random_set_up(n, kind, trial);
+        through_files(kind == ON_A_LINE || n < 4 ? &any_turn : &w, &l);
+        lights_free(&l);
+    }
+    struct lights many = random_set_up(LIGHTS_MAX, 1, 1000);
+    through_files(&w, &many);
+    lights_free(&many);
+    log_set_level(LOG_INFO);
+    print_message(
+        "# lights.json: centre %.2g m, rotation %.2g, 1/r %.2g; on a line: centre %.2g m, "
+        "directions %.2g\n",
+        w.centre_m, w.rotation, w.inverse_distance, any_turn.centre_m, any_turn.dir_world);
+    assert_true(w.centre_m < 1e-12 && w.rotation < 1e-14 && w.dir_world < 1e-14);
+    assert_true(any_turn.centre_m < 1e-12 && any_turn.dir_world < 1e-14);
+    assert_true(w.inverse_distance < 1e-15 && any_turn.inverse_distance < 1e-15);
+}
+
+static void regions_and_spreads_come_back_from_a_file(void **state)
 {
     (void)state;
     struct panorama p = room(16);
-    struct lights cut, plain = near_lights(64), back;
+    struct lights cut, unknown, near = near_lights(64);
+    struct worst w = {0};
+    assert_int_equal(lights_median_cut(&unknown, &p, 64), 0);
     assert_int_equal(lights_median_cut(&cut, &p, 64), 0);
-    memcpy(cut.world_from_probe, plain.world_from_probe, sizeof(cut.world_from_probe));
-    memcpy(cut.centre_m, plain.centre_m, sizeof(cut.centre_m));
-    memcpy(cut.inverse_distance, plain.inverse_distance, 64 * sizeof(double));
-    for (int i = 0; i < 64; i++)
-        cut.group[i] = i % 5 - 1;
-    const struct lights *const both[] = {&cut, &plain};
-    for (int k = 0; k < 2; k++) {
-        const struct lights *l = both[k];
-        const char *first = in_folder("lights.json"), *second = in_folder("again.json");
-        assert_int_equal(lights_write_json(l, first), 0);
-        assert_int_equal(lights_read_json(&back, first), 0);
-        assert_int_equal(back.n, l->n);
-        assert_memory_equal(back.dir_probe, l->dir_probe, 64 * sizeof(*l->dir_probe));
-        assert_memory_equal(back.irradiance, l->irradiance, 64 * sizeof(*l->irradiance));
-        assert_memory_equal(back.centre_m, l->centre_m, sizeof(l->centre_m));
-        assert_memory_equal(back.world_from_probe, l->world_from_probe,
-                            sizeof(l->world_from_probe));
-        assert_memory_equal(back.group, l->group, 64 * sizeof(*l->group));
-        assert_int_equal(back.panorama_width_px, l->panorama_width_px);
-        assert_true(!back.region == !l->region && !back.spread_rad == !l->spread_rad);
-        if (l->region) {
-            assert_memory_equal(back.region, l->region, 64 * sizeof(*l->region));
-            assert_memory_equal(back.spread_rad, l->spread_rad, 64 * sizeof(double));
-        }
-        for (int i = 0; i < 64; i++)
-            assert_true(fabs(back.inverse_distance[i] - l->inverse_distance[i]) <=
-                        2.3e-16 * l->inverse_distance[i]);
-        // And from then on nothing moves.
-        assert_int_equal(lights_write_json(&back, second), 0);
-        struct lights third;
-        assert_int_equal(lights_read_json(&third, second), 0);
-        assert_memory_equal(third.inverse_distance, back.inverse_distance, 64 * sizeof(double));
-        size_t n[2];
-        char *text[2] = {text_of(first, &n[0]), text_of(second, &n[1])};
-        assert_int_equal(n[0], n[1]);
-        assert_memory_equal(text[0], text[1], n[0]);
-        free(text[0]);
-        free(text[1]);
-        unlink(first);
-        unlink(second);
-        lights_free(&back);
-        lights_free(&third);
-    }
+    memcpy(cut.world_from_probe, near.world_from_probe, sizeof(cut.world_from_probe));
+    memcpy(cut.centre_m, near.centre_m, sizeof(cut.centre_m));
+    memcpy(cut.inverse_distance, near.inverse_distance, 64 * sizeof(double));
+    through_files(&w, &cut);
+    assert_true(w.centre_m < 1e-12 && w.rotation < 1e-14);
+    w = (struct worst){0};
+    through_files(&w, &unknown); // without a set-up: exactly so
+    assert_true(w.centre_m == 0 && w.rotation == 0);
     lights_free(&cut);
-    lights_free(&plain);
+    lights_free(&unknown);
+    lights_free(&near);
     panorama_free(&p);
 }
 
-static int parse(struct lights *out, const char *head, const char *light)
+// A far light is worth its direction, no more: its place is rounded to more than the hall is long.
+static void lights_far_away_do_not_move_the_centre(void **state)
+{
+    (void)state;
+    struct worst w = {0};
+    struct lights l = random_set_up(64, 0, 2000), back;
+    for (int i = 32; i < 64; i++)
+        l.inverse_distance[i] = (const double[]){1e-6, 1e-14, 1e-17, 1e-300}[i % 4];
+    const char *path = in_folder("far.json");
+    assert_int_equal(lights_write_json(&l, path), 0);
+    assert_int_equal(lights_read_json(&back, path), 0);
+    unlink(path);
+    for (int i = 32; i < 64; i++)
+        l.inverse_distance[i] = l.inverse_distance[i] < 1e-15 ? 0 : l.inverse_distance[i];
+    compare_set_ups(&w, &l, &back);
+    assert_true(w.centre_m < 1e-12 && w.rotation < 1e-14 && w.inverse_distance < 1e-15);
+    lights_free(&l);
+    lights_free(&back);
+}
+
+static void the_file_is_a_list_that_says_where_lights_are_in_the_world(void **state)
+{
+    (void)state;
+    struct lights l = near_lights(8), plain;
+    struct json *doc;
+    const char *path = in_folder("list.json");
+    assert_int_equal(lights_write_json(&l, path), 0);
+    assert_int_equal(json_read(&doc, path), 0);
+    assert_int_equal(json_length(doc, ""), 8);
+    for (int i = 0; i < 8; i++) {
+        char key[64];
+        double said[3], dir[3], pos[3], distance_m;
+        mat3_mul_vec(dir, l.world_from_probe, l.dir_probe[i]);
+        snprintf(key, sizeof(key), "%d.dir_world", i);
+        assert_int_equal(json_get_numbers(doc, key, said, 3), 0);
+        assert_memory_equal(said, dir, sizeof(dir));
+        snprintf(key, sizeof(key), "%d.distance_m", i);
+        const int directional = l.inverse_distance[i] > 0 ? 0 : -EINVAL;
+        assert_int_equal(json_get_number(doc, key, &distance_m), directional);
+        snprintf(key, sizeof(key), "%d.pos_m", i);
+        assert_int_equal(json_get_numbers(doc, key, said, 3), directional);
+        if (directional)
+            continue;
+        assert_near(distance_m, 1 / l.inverse_distance[i], 0);
+        vec3_add_scaled(pos, l.centre_m, distance_m, dir);
+        vec3_sub(pos, pos, said);
+        assert_true(vec3_norm(pos) < 1e-14);
+    }
+    json_free(doc);
+    // Nobody has said where these are: nor does the file.
+    assert_int_equal(lights_new(&plain, 1), 0);
+    plain.dir_probe[0][2] = 1;
+    assert_int_equal(lights_write_json(&plain, path), 0);
+    assert_int_equal(json_read(&doc, path), 0);
+    assert_null(json_get(doc, "0.dir_world"));
+    json_free(doc);
+    unlink(path);
+    lights_free(&plain);
+    lights_free(&l);
+}
+
+// Only what the contract outside names; six decimals; wrapped or not.
+static void foreign_files_are_read_by_the_places_of_their_lights(void **state)
+{
+    (void)state;
+    static char text[1 << 16];
+    for (int trial = 0; trial < 40; trial++) {
+        const int digits = trial % 2 ? 6 : 17, kind = trial / 2 % 2;
+        struct lights l = random_set_up(9 + trial, kind, trial), back;
+        int used = snprintf(text, sizeof(text), trial % 4 < 2 ? "[" : "{\"by\":[],\"lights\":[");
+        for (int i = 0; i < l.n; i++) {
+            const double q = l.inverse_distance[i], *d = l.dir_probe[i];
+            double at[3], dir[3];
+            mat3_mul_vec(dir, l.world_from_probe, d);
+            vec3_add_scaled(at, l.centre_m, q > 0 ? 1 / q : 0, dir);
+            used += snprintf(text + used, sizeof(text) - (size_t)used,
+                             "%s{\"dir_probe\":[%.*f,%.*f,%.*f],\"irradiance\":[1,2,3],",
+                             i ? "," : "", digits, d[0], digits, d[1], digits, d[2]);
+            used += q > 0 ? snprintf(text + used, sizeof(text) - (size_t)used,
+                                     "\"distance_m\":%.*f,\"pos_m\":[%.*f,%.*f,%.*f]", digits,
+                                     1 / q, digits, at[0], digits, at[1], digits, at[2])
+                          : snprintf(text + used, sizeof(text) - (size_t)used,
+                                     "\"distance_m\":null,\"pos_m\":null");
+            used += snprintf(text + used, sizeof(text) - (size_t)used, "%s}",
+                             i % 2 ? ",\"group\":null" : "");
+        }
+        used += snprintf(text + used, sizeof(text) - (size_t)used, trial % 4 < 2 ? "]" : "]}");
+        assert_int_equal(lights_parse_json(&back, text, (size_t)used, "foreign.json"), 0);
+        struct worst w = {0};
+        compare_set_ups(&w, &l, &back);
+        assert_true(digits == 6 || (w.centre_m < 1e-13 && w.rotation < 1e-14));
+        assert_true(w.centre_m < 3e-6 && w.rotation < 3e-6);
+        for (int i = 0; i < l.n; i++)
+            assert_int_equal(back.group[i], -1);
+        lights_free(&l);
+        lights_free(&back);
+    }
+}
+
+static int parse(struct lights *out, const char *light)
 {
     static char text[4096];
-    snprintf(text, sizeof(text), "{\"format\":\"studiorig-lights-1\",%s,\"lights\":[{%s}]}", head,
-             light);
+    snprintf(text, sizeof(text), "[{%s}]", light);
     last_error[0] = 0;
     return lights_parse_json(out, text, strlen(text), "hostile.json");
 }
 
-#define PLACE "\"centre_m\":[0,0,0],\"world_from_probe\":[[1,0,0],[0,1,0],[0,0,1]]"
-#define WITH_PANORAMA PLACE ",\"panorama\":{\"width\":8,\"height\":4}"
-#define LIGHT "\"dir_probe\":[0,0,1],\"irradiance\":[1,1,1],\"distance_m\":2"
+#define SUN "\"dir_probe\":[0,0,1],\"irradiance\":[1,1,1],\"distance_m\":null"
+#define LIGHT                                                                                      \
+    "\"dir_probe\":[0,0,1],\"dir_world\":[1,0,0],\"irradiance\":[1,1,1],\"distance_m\":2,"         \
+    "\"pos_m\":[2,0,0]"
+#define PANORAMA "\"panorama_px\":[8,4]"
+#define AT(dir, r, pos)                                                                            \
+    "\"dir_probe\":" dir ",\"irradiance\":[1,1,1],\"distance_m\":" r ",\"pos_m\":" pos
+#define TO(dir, world)                                                                             \
+    "\"dir_probe\":" dir ",\"irradiance\":[1,1,1],\"distance_m\":null,\"dir_world\":" world
+#define X_Y_Z                                                                                      \
+    AT("[1,0,0]", "1", "[1,0,0]")                                                                  \
+    "},{" AT("[0,1,0]", "1", "[0,1,0]") "},{" AT("[0,0,1]", "1", "[0,0,1]")
 
 static void wrong_lights_are_refused_by_name(void **state)
 {
     (void)state;
     static const struct {
-        const char *head, *light, *says; // in the error
+        const char *light, *says; // in the error
     } bad[] = {
-        {"\"world_from_probe\":[[1,0,0],[0,1,0],[0,0,1]]", LIGHT, "centre_m"},
-        {"\"centre_m\":[0,0,0]", LIGHT, "world_from_probe"},
-        {"\"centre_m\":[0,0],\"world_from_probe\":[[1,0,0],[0,1,0],[0,0,1]]", LIGHT, "centre_m"},
-        {"\"centre_m\":[0,0,1e10],\"world_from_probe\":[[1,0,0],[0,1,0],[0,0,1]]", LIGHT,
-         "centre_m"},
-        {"\"centre_m\":[0,0,0],\"world_from_probe\":[[1,0,0],[0,1,0],[0,0,-1]]", LIGHT, "mirrored"},
-        {"\"centre_m\":[0,0,0],\"world_from_probe\":[[1,0,0],[0,1.01,0],[0,0,1]]", LIGHT,
-         "orthonormal"},
-        {"\"centre_m\":[0,0,0],\"world_from_probe\":[[1,0,0],[1,0,0],[0,0,1]]", LIGHT,
-         "orthonormal"},
-        {PLACE ",\"panorama\":{\"width\":8,\"height\":8}", LIGHT, "panorama"},
-        {PLACE ",\"panorama\":{\"width\":8.5,\"height\":4.25}", LIGHT, "panorama"},
-        {PLACE ",\"panorama\":{\"width\":131072,\"height\":65536}", LIGHT, "panorama"},
-        {PLACE, "\"irradiance\":[1,1,1],\"distance_m\":2", "dir_probe"},
-        {PLACE, "\"dir_probe\":[0,0,1],\"distance_m\":2", "irradiance"},
-        {PLACE, "\"dir_probe\":[0,0,1],\"irradiance\":[1,1,1]", "distance_m"},
-        {PLACE, "\"dir_probe\":[0,0,1,0],\"irradiance\":[1,1,1],\"distance_m\":2", "dir_probe"},
-        {PLACE, "\"dir_probe\":[0,0,1.001],\"irradiance\":[1,1,1],\"distance_m\":2", "unit"},
-        {PLACE, "\"dir_probe\":[0,0,0],\"irradiance\":[1,1,1],\"distance_m\":2", "unit"},
-        {PLACE, "\"dir_probe\":[0,0,1e308],\"irradiance\":[1,1,1],\"distance_m\":2", "unit"},
-        {PLACE, "\"dir_probe\":[0,0,1],\"irradiance\":[1,-1e-9,1],\"distance_m\":2", "irradiance"},
-        {PLACE, "\"dir_probe\":[0,0,1],\"irradiance\":[1,1e31,1],\"distance_m\":2", "irradiance"},
-        {PLACE, "\"dir_probe\":[0,0,1],\"irradiance\":[1,1,1],\"distance_m\":0", "distance_m"},
-        {PLACE, "\"dir_probe\":[0,0,1],\"irradiance\":[1,1,1],\"distance_m\":-2", "distance_m"},
-        {PLACE, "\"dir_probe\":[0,0,1],\"irradiance\":[1,1,1],\"distance_m\":5e-324", "distance_m"},
-        {PLACE, "\"dir_probe\":[0,0,1],\"irradiance\":[1,1,1],\"distance_m\":{}", "distance_m"},
-        {PLACE, "\"dir_probe\":[0,0,1],\"irradiance\":[1,1,1],\"distance_m\":\"2\"", "distance_m"},
-        {PLACE, LIGHT ",\"pos_m\":[0,0,2.1]", "pos_m"},
-        {PLACE, LIGHT ",\"group\":1", "group"},
-        {PLACE, LIGHT ",\"group\":-2", "group"},
-        {PLACE, LIGHT ",\"group\":0.5", "group"},
-        {PLACE, LIGHT ",\"region\":[0,0,1,1]", "region"}, // no panorama to lie in
-        {WITH_PANORAMA, LIGHT ",\"region\":[0,0,9,1]", "region"},
-        {WITH_PANORAMA, LIGHT ",\"region\":[4,0,3,1]", "region"},
-        {WITH_PANORAMA, LIGHT ",\"region\":[0,3,1,1]", "region"},
-        {WITH_PANORAMA, LIGHT ",\"region\":[-1,0,1,1]", "region"},
-        {WITH_PANORAMA, LIGHT ",\"region\":[0,0,1.5,1]", "region"},
-        {WITH_PANORAMA, LIGHT ",\"region\":[0,0,1]", "region"},
-        {PLACE, LIGHT ",\"spread_rad\":-1", "spread_rad"},
-        {PLACE, LIGHT ",\"spread_rad\":4", "spread_rad"},
-        {WITH_PANORAMA, LIGHT ",\"region\":[0,0,1,1]},{" LIGHT,
-         "lights.1.region"}, // of one, not of the other
+        {"\"irradiance\":[1,1,1],\"distance_m\":null", "0.dir_probe"},
+        {"\"dir_probe\":[0,0,1],\"distance_m\":null", "0.irradiance"},
+        {"\"dir_probe\":[0,0,1],\"irradiance\":[1,1,1]", "0.distance_m"},
+        {"\"dir_probe\":[0,0,1,0],\"irradiance\":[1,1,1],\"distance_m\":null", "0.dir_probe"},
+        {"\"dir_probe\":[0,0,1.001],\"irradiance\":[1,1,1],\"distance_m\":null", "unit"},
+        {"\"dir_probe\":[0,0,0],\"irradiance\":[1,1,1],\"distance_m\":null", "unit"},
+        {"\"dir_probe\":[0,0,1e308],\"irradiance\":[1,1,1],\"distance_m\":null", "unit"},
+        {"\"dir_probe\":[0,0,1],\"irradiance\":[1,-1e-9,1],\"distance_m\":null", "0.irradiance"},
+        {"\"dir_probe\":[0,0,1],\"irradiance\":[1,1e31,1],\"distance_m\":null", "0.irradiance"},
+        {AT("[0,0,1]", "0", "[0,0,0]"), "0.distance_m"},
+        {AT("[0,0,1]", "-2", "[0,0,-2]"), "0.distance_m"},
+        {AT("[0,0,1]", "5e-324", "[0,0,0]"), "0.distance_m"},
+        {AT("[0,0,1]", "2e15", "[0,0,2e15]"), "0.distance_m"},
+        {AT("[0,0,1]", "{}", "[0,0,0]"), "0.distance_m"},
+        {AT("[0,0,1]", "\"2\"", "[0,0,2]"), "0.distance_m"},
+        {AT("[0,0,1]", "2", "null"), "0.pos_m"},
+        {AT("[0,0,1]", "2", "[0,2]"), "0.pos_m"},
+        {AT("[0,0,1]", "2", "[0,0,1e10]"), "0.pos_m"},
+        {AT("[0,0,1]", "null", "[0,0,2]"), "0.pos_m"},
+        {"\"dir_probe\":[0,0,1],\"irradiance\":[1,1,1],\"distance_m\":2", "0.pos_m"},
+        {SUN ",\"dir_world\":[0,0]", "0.dir_world"},
+        {SUN ",\"dir_world\":[0,0,0]", "unit"},
+        {SUN ",\"dir_world\":[0,0,1.001]", "unit"},
+        {LIGHT ",\"group\":1", "0.group"},
+        {LIGHT ",\"group\":-2", "0.group"},
+        {LIGHT ",\"group\":0.5", "0.group"},
+        {LIGHT ",\"region_px\":[0,0,1,1]", "0.panorama_px"}, // no panorama to lie in
+        {LIGHT ",\"region_px\":[0,0,1,1],\"panorama_px\":[8,8]", "0.panorama_px"},
+        {LIGHT ",\"region_px\":[0,0,1,1],\"panorama_px\":[5,2.5]", "0.panorama_px"},
+        {LIGHT ",\"region_px\":[0,0,0,0],\"panorama_px\":[0,0]", "0.panorama_px"},
+        {LIGHT ",\"region_px\":[0,0,1,1],\"panorama_px\":[131072,65536]", "0.panorama_px"},
+        {LIGHT "," PANORAMA ",\"region_px\":[0,0,9,1]", "0.region_px"},
+        {LIGHT "," PANORAMA ",\"region_px\":[0,0,1,5]", "0.region_px"},
+        {LIGHT "," PANORAMA ",\"region_px\":[4,0,3,1]", "0.region_px"},
+        {LIGHT "," PANORAMA ",\"region_px\":[0,3,1,1]", "0.region_px"},
+        {LIGHT "," PANORAMA ",\"region_px\":[-1,0,1,1]", "0.region_px"},
+        {LIGHT "," PANORAMA ",\"region_px\":[0,0,1.5,1]", "0.region_px"},
+        {LIGHT "," PANORAMA ",\"region_px\":[0,0,1]", "0.region_px"},
+        {LIGHT "," PANORAMA ",\"region_px\":[0,0,1,1]},{" LIGHT
+               ",\"region_px\":[0,0,1,1],\"panorama_px\":[4,2]",
+         "1.panorama_px"},
+        {LIGHT "," PANORAMA ",\"region_px\":[0,0,1,1]},{" LIGHT "," PANORAMA,
+         "1.region_px"}, // of one, not of the other
+        {LIGHT ",\"spread_rad\":-1", "0.spread_rad"},
+        {LIGHT ",\"spread_rad\":4", "0.spread_rad"},
+        {LIGHT ",\"spread_rad\":0},{" LIGHT, "1.spread_rad"},
+        // Together they make no sense, or too little.
+        {AT("[0,0,1]", "2", "[0,0,2]"), "dir_world is with 0 of 1"},
+        {AT("[0,0,1]", "2", "[0,0,2]") "},{" AT("[0,1,0]", "2", "[0,2,0]"), "one line"},
+        {AT("[0,0,1]", "2", "[0,0,2]") "},{" AT("[0,0,1]", "3", "[0,0,3]") "},{" AT("[0,0,-1]", "3",
+                                                                                    "[0,0,-3]"),
+         "one line"},
+        {LIGHT "},{" SUN, "dir_world is with 1 of 2"},
+        {SUN "},{" SUN ",\"dir_world\":[0,0,1]", "dir_world is with 1 of 2"},
+        {X_Y_Z "},{" AT("[0,0,-1]", "3", "[0,0,-3.01]"), "pos_m"},
+        {X_Y_Z "},{" AT("[0,0,-1]", "3", "[0,0,-4]"), "3.pos_m: found [0,0,-4]"},
+        {X_Y_Z "},{" TO("[0,1,0]", "[1,0,0]"), "3.dir_world"},
+        {TO("[1,0,0]", "[0,1,0]") "},{" TO("[0,1,0]", "[0.6,0.8,0]"), "dir_world"},
+        {TO("[1,0,0]", "[1,0,0]") "},{" TO("[0,1,0]", "[0,1,0]") "},{" TO("[0,0,1]", "[0,0,-1]"),
+         "mirrored"},
+        {AT("[1,0,0]", "1", "[1,0,0]") "},{" AT("[0,1,0]", "1", "[0,1,0]") "},{" AT(
+             "[0,0,1]", "1", "[0,0,-1]") "},{" AT("[0,0,-1]", "1", "[0,0,1]"),
+         "mirrored"},
+        {LIGHT "},{" LIGHT "},{\"dir_probe\":[0,0,1],\"dir_world\":[1,0,0],\"irradiance\":[1,1,1],"
+               "\"distance_m\":2,\"pos_m\":[3,0,0]",
+         "2.pos_m"},
+        {"\"dir_probe\":[0,0,1],\"dir_world\":[0,0,1],\"irradiance\":[1,1,1],\"distance_m\":1e15,"
+         "\"pos_m\":[1e14,0,0]",
+         "1e9 m away"},
     };
     struct lights l;
     log_set_hook(remember, NULL);
     for (size_t i = 0; i < sizeof(bad) / sizeof(bad[0]); i++) {
-        const int err = parse(&l, bad[i].head, bad[i].light);
+        const int err = parse(&l, bad[i].light);
         if (err != -EINVAL || !strstr(last_error, bad[i].says) ||
             !strstr(last_error, "hostile.json"))
             fail_msg("case %zu: %d, said \"%s\", expected the word %s", i, err, last_error,
                      bad[i].says);
         assert_true(l.n == 0 && !l.dir_probe);
     }
-    static const char *const broken[] = {
-        "",
-        "{",
-        "[]",
-        "{}",
-        "3",
-        "{\"format\":\"studiorig-lights-2\"}",
-        "{\"format\":\"studiorig-lights-1\"," PLACE "}",
-        "{\"format\":\"studiorig-lights-1\"," PLACE ",\"lights\":{}}",
-        "{\"format\":\"studiorig-lights-1\"," PLACE ",\"lights\":[]}",
-        "{\"format\":\"studiorig-lights-1\"," PLACE ",\"lights\":[7]}"};
+    static const char *const broken[] = {"",       "{",
+                                         "[]",     "{}",
+                                         "3",      "null",
+                                         "[7]",    "[[]]",
+                                         "[{}]",   "{\"lights\":{}}",
+                                         "\"[]\"", "{\"lights\":[]}",
+                                         "[null]", "{\"lights\":{\"lights\":[]}}"};
     for (size_t i = 0; i < sizeof(broken) / sizeof(broken[0]); i++) {
         last_error[0] = 0;
         assert_int_equal(lights_parse_json(&l, broken[i], strlen(broken[i]), "hostile.json"),
@@ -661,17 +861,15 @@ static void wrong_lights_are_refused_by_name(void **state)
 static void more_lights_than_the_limit_are_refused(void **state)
 {
     (void)state;
-    const char *start = "{\"format\":\"studiorig-lights-1\"," PLACE ",\"lights\":[";
     const size_t n = LIGHTS_MAX + 1;
-    char *text = malloc(strlen(start) + 3 * n + 3);
+    char *text = malloc(3 * n + 2);
     assert_non_null(text);
-    char *end = text + sprintf(text, "%s", start);
     for (size_t i = 0; i < n; i++)
-        end += sprintf(end, i ? ",{}" : "{}");
-    end += sprintf(end, "]}");
+        memcpy(text + 3 * i, i ? ",{}" : "[{}", 3);
+    text[3 * n] = ']';
     struct lights l;
     log_set_hook(remember, NULL);
-    assert_int_equal(lights_parse_json(&l, text, (size_t)(end - text), "big.json"), -EINVAL);
+    assert_int_equal(lights_parse_json(&l, text, 3 * n + 1, "big.json"), -EINVAL);
     assert_non_null(strstr(last_error, "65536"));
     log_set_hook(NULL, NULL);
     free(text);
@@ -681,14 +879,21 @@ static void what_a_hand_may_write_is_read(void **state)
 {
     (void)state;
     struct lights l;
-    assert_int_equal(parse(&l, PLACE, LIGHT ",\"pos_m\":[0,0,2]"), 0);
+    assert_int_equal(parse(&l, LIGHT), 0);
     assert_true(l.inverse_distance[0] == .5 && l.group[0] == -1 && !l.region && !l.spread_rad);
+    assert_true(vec3_norm(l.centre_m) < 1e-15);
     lights_free(&l);
-    assert_int_equal(parse(&l, PLACE ",\"panorama\":null",
-                           "\"dir_probe\":[0,0,1.0000005],\"irradiance\":[0,1,2],\"distance_m\":"
-                           "null,\"group\":null"),
+    assert_int_equal(parse(&l, "\"dir_probe\":[0,0,1.0000005],\"irradiance\":[0,1,2],"
+                               "\"distance_m\":null,\"group\":null,\"dir_world\":null"),
                      0);
     assert_true(l.inverse_distance[0] == 0 && l.dir_probe[0][2] == 1); // renormalised
+    assert_true(l.world_from_probe[0] == 1 && l.centre_m[0] == 0);
+    lights_free(&l);
+    assert_int_equal(parse(&l, X_Y_Z "},{" AT("[0,0,-1]", "1e12", "[0,0,-1e12]")), 0); // a sun
+    assert_true(fabs(l.world_from_probe[0] - 1) < 1e-15 && vec3_norm(l.centre_m) < 1e-15);
+    lights_free(&l);
+    assert_int_equal(parse(&l, X_Y_Z "},{" TO("[0,-1,0]", "[0,-1,0]")), 0); // not all say it
+    assert_true(fabs(l.world_from_probe[0] - 1) < 1e-15 && vec3_norm(l.centre_m) < 1e-15);
     lights_free(&l);
 }
 
@@ -1041,7 +1246,11 @@ int main(void)
         cmocka_unit_test(direction_and_spread_are_energy_weighted),
         cmocka_unit_test(what_cannot_be_split_gives_empty_lights),
         cmocka_unit_test(photographed_studios_keep_their_energy),
-        cmocka_unit_test(lights_survive_a_file_bit_for_bit),
+        cmocka_unit_test(set_ups_come_back_from_a_file_to_rounding),
+        cmocka_unit_test(regions_and_spreads_come_back_from_a_file),
+        cmocka_unit_test(lights_far_away_do_not_move_the_centre),
+        cmocka_unit_test(the_file_is_a_list_that_says_where_lights_are_in_the_world),
+        cmocka_unit_test(foreign_files_are_read_by_the_places_of_their_lights),
         cmocka_unit_test(wrong_lights_are_refused_by_name),
         cmocka_unit_test(more_lights_than_the_limit_are_refused),
         cmocka_unit_test(what_a_hand_may_write_is_read),

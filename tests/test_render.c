@@ -19,8 +19,7 @@
 static const double origin_m[3] = {0, 0, 0};
 static const double z_up[3] = {0, 0, 1};
 
-// ---- what the tests look at
-// ----------------------------------------------------------------------
+// ---- what the tests look at ---------------------------------------------------------------------
 
 static struct camera camera_at(double x, double y, double z, const double target_m[3], int width_px,
                                int height_px, double focal_px)
@@ -137,8 +136,7 @@ static struct render_material lambert(float albedo)
                                     .constant_albedo = {albedo, albedo, albedo}};
 }
 
-// ---- an independent path: all in double, every triangle asked
-// -------------------------------------
+// ---- an independent path: all in double, every triangle asked -----------------------------------
 
 struct found {
     double position[3], normal[3], tangent[3], uv[2];
@@ -318,8 +316,7 @@ static void a_white_convex_body_in_uniform_light_is_uniform(void **state)
     lights_free(&lights), mesh_free(&mesh);
 }
 
-// ---- shadows
-// -------------------------------------------------------------------------------------
+// ---- shadows ------------------------------------------------------------------------------------
 
 static void traced_shadows_are_those_of_every_triangle(void **state)
 {
@@ -421,8 +418,7 @@ static void grouped_shadows_agree_with_traced_ones_on_average(void **state)
     image_free(&exact), image_free(&open), lights_free(&lights), mesh_free(&mesh);
 }
 
-// ---- the bounce
-// ----------------------------------------------------------------------------------
+// ---- the bounce ---------------------------------------------------------------------------------
 
 // Inside a sphere, cosine-distributed rays from any point end uniformly over the area. So one
 // bounce gives every point rho x the mean irradiance, whatever the lights. A light with Eq. 3's
@@ -492,8 +488,7 @@ static void a_bowl_brightens_inside_and_makes_no_energy(void **state)
     image_free(&direct), image_free(&both), lights_free(&lights), mesh_free(&mesh);
 }
 
-// ---- textures, samples, threads
-// --------------------------------------------------------------------
+// ---- textures, samples, threads -----------------------------------------------------------------
 
 static void make_square(struct mesh *mesh)
 {
@@ -642,8 +637,7 @@ static void threads_do_not_change_a_bit_and_seeds_do(void **state)
     image_free(&a), image_free(&b), image_free(&c), lights_free(&lights), mesh_free(&mesh);
 }
 
-// ---- where things break
-// ----------------------------------------------------------------------------
+// ---- where things break -------------------------------------------------------------------------
 
 static void extreme_materials_and_lights_give_finite_pixels(void **state)
 {

@@ -16,6 +16,7 @@
 #include <errno.h>
 #include <math.h>
 #include <stdbool.h>
+#include <stddef.h>
 #include <stdio.h>
 #include <stdlib.h>
 #include <string.h>
@@ -89,7 +90,7 @@ static error_t parse_option(int key, char *arg, struct argp_state *state)
 // What is printed, in order: f, theta, albedo, light, normal. Kernels give the first N_SHADED.
 enum { N_SHADED = 3 + 3 * DISNEY_N + 9, N_VALUES = N_SHADED + 18, NAME_LENGTH = 40 };
 static_assert(sizeof(struct disney_gradient) == N_VALUES * sizeof(double), "the names below follow the struct");
-static_assert(sizeof(struct shade_jacobian) == N_SHADED * sizeof(float), "the names below follow the struct");
+static_assert(offsetof(struct shade_jacobian, own) == N_SHADED * sizeof(float), "the names below follow the struct");
 
 static void name_values(char names[N_VALUES][NAME_LENGTH])
 {

@@ -85,8 +85,8 @@ static const struct argp argp = {
     "looking along +Z, its left edge at longitude +180 degrees. The output lists for every light "
     "its "
     "direction in the probe's frame, its irradiance (radiance times solid angle, RGB) and its "
-    "rectangle of the panorama. All lights are directional until a solve has found their "
-    "distances.",
+    "rectangle of the panorama. All lights are directional, and where they are in the world is not "
+    "said, until a solve has found it.",
     NULL,
     NULL,
     NULL,

@@ -65,7 +65,8 @@ static const struct argp_option options[] = {
     { "world-from-probe", OPTION_WORLD_FROM_PROBE, "FILE", 0,
       "JSON with world_from_probe (3x3) and perhaps centre_m; default: the take's start.json", 1 },
     { "centre", OPTION_CENTRE, "X,Y,Z", 0,
-      "where the panorama was taken, metres; default: the middle of the mesh's bounding box", 1 },
+      "where the panorama was taken, metres; default: what lights.json says by the places of its "
+      "lights, else the middle of the mesh's bounding box", 1 },
     { "distance", OPTION_DISTANCE, "M", 0,
       "distance of all lights from there, metres; default: infinity (or what lights.json says)",
       1 },
@@ -313,7 +314,9 @@ static int load_lights(struct scene *scene, const struct settings *s)
                     : lights_median_cut(l, &scene->panorama, s->n_lights);
     if (err)
         return err;
-    bool has_centre = s->lights != NULL;
+    bool has_centre = false; // a lights.json tells it by the places of its lights
+    for (int i = 0; s->lights && i < l->n; i++)
+        has_centre = has_centre || l->inverse_distance[i] > 0;
     if (s->world_from_probe) {
         err = read_world_from_probe(s->world_from_probe, l, &has_centre);
         if (err)

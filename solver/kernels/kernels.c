@@ -5,6 +5,7 @@
 #include "solver/take/log.h"
 #include "solver/vec3.h"
 
+#include <assert.h>
 #include <errno.h>
 #include <limits.h>
 #include <stdlib.h>
@@ -70,11 +71,14 @@ int lit_new(struct lit *out, int n_lights)
         return -ENOMEM;
     // One vector more than the lights: compaction stores whole vectors.
     struct lit l = { .capacity = padded(n_lights) + KERNEL_WIDTH };
+    float *index;
     float **const arrays[] = { &l.lx, &l.ly, &l.nl, &l.sl, &l.gc, &l.wr, &l.wg, &l.wb,
-                               &l.lx_rest, &l.ly_rest, &l.g, &l.g_r, &l.g_a };
-    const int err = new_arrays(arrays, 13, l.capacity);
+                               &l.lx_rest, &l.ly_rest, &l.g, &l.g_r, &l.g_a, &l.facing, &index };
+    static_assert(sizeof(*l.index) == sizeof(*index), "index lies in the same block");
+    const int err = new_arrays(arrays, 15, l.capacity);
     if (err)
         return err;
+    l.index = (int32_t *)index;
     *out = l;
     return 0;
 }

@@ -33,6 +33,7 @@ struct lit {
     float *lx, *ly, *nl, *sl /* S(nl) = (1-nl)^5 */, *gc /* clearcoat's g1(nl, .25) */, *wr, *wg, *wb;
     float *lx_rest, *ly_rest; // what float left of lx, ly: sharp lobes need it
     float *g, *g_r, *g_a;     // scratch of shade_jacobian_views
+    float *facing;            // <l,d>: how much the light faces the point
     int32_t *index;           // which light
 };
 int lit_new(struct lit *out, int n_lights); // 0 or -ENOMEM
@@ -49,7 +50,8 @@ struct shade_jacobian {      // of outgoing radiance L (3 channels)
     float own[3];            // dL / d albedo of the same channel at fixed tint: L is affine in it (SOLVER.md 4)
 };
 
-// How L changes when the set-up moves: l_i and c_i(p) by Eqs. 1-4, f and the cosine by l.
+// How L changes when the set-up moves: l_i and c_i(p) by Eqs. 1-4, f and the cosine by l. A light at the horizon is a kink of L: what
+// is given holds for the lights above it.
 struct shade_setup {
     float *inverse_distance[3]; // [channel][lights->n_padded], the caller's arrays: dL / d(1/r_i); 0 where light i adds nothing
     float centre[3][3];         // [channel][x, y, z]: dL / dc

@@ -93,6 +93,24 @@ V void v_compress(float *p, vf x, v_mask m)
     _mm_storeu_ps(p, _mm_permutevar_ps(_mm256_castps256_ps128(x), low_i));
     _mm_storeu_ps(p + __builtin_popcount(low), _mm_permutevar_ps(_mm256_extractf128_ps(x, 1), high_i));
 }
+V void v_compress_index(int32_t *p, int first, v_mask m)
+{
+    const unsigned low = m & 15, high = m >> 4 & 15;
+    const __m128i low_i = _mm_loadu_si128((const __m128i *)front[low]);
+    const __m128i high_i = _mm_loadu_si128((const __m128i *)front[high]);
+    _mm_storeu_si128((__m128i *)p, _mm_add_epi32(low_i, _mm_set1_epi32(first)));
+    _mm_storeu_si128((__m128i *)(p + __builtin_popcount(low)), _mm_add_epi32(high_i, _mm_set1_epi32(first + 4)));
+}
+V vf v_gather(const float *p, const int32_t *index)
+{
+    return _mm256_i32gather_ps(p, _mm256_load_si256((const __m256i *)index), 4);
+}
+// The first n lanes.
+V void v_scatter(float *p, const int32_t *index, vf x, int n)
+{
+    for (int i = 0; i < LANES && i < n; i++)
+        p[index[i]] = x[i];
+}
 V vf v_bytes(const uint8_t *p, int n)
 {
     uint64_t bytes = 0;
@@ -121,6 +139,7 @@ V void add_up(const vf *x, int n, float *sums)
 
 static const struct kernels table = {
     "avx2", gather, shade, shade_jacobian, brute_jacobian, irradiance, shade_jacobian_views,
+    shade_affine, shade_setup, irradiance_setup,
 };
 const struct kernels *const kernels_avx2_table = &table;
 #else

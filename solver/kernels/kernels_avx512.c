@@ -83,6 +83,21 @@ V void v_compress(float *p, vf x, v_mask m)
 {
     _mm512_storeu_ps(p, _mm512_maskz_compress_ps(m, x));
 }
+V void v_compress_index(int32_t *p, int first, v_mask m)
+{
+    const __m512i lane = _mm512_setr_epi32(0, 1, 2, 3, 4, 5, 6, 7, 8, 9, 10, 11, 12, 13, 14, 15);
+    _mm512_storeu_si512(p, _mm512_maskz_compress_epi32(m, _mm512_add_epi32(_mm512_set1_epi32(first), lane)));
+}
+V vf v_gather(const float *p, const int32_t *index)
+{
+    return _mm512_i32gather_ps(_mm512_load_si512(index), p, 4);
+}
+// The first n lanes.
+V void v_scatter(float *p, const int32_t *index, vf x, int n)
+{
+    const v_mask there = (v_mask)(n >= LANES ? 0xffff : (1u << n) - 1);
+    _mm512_mask_i32scatter_ps(p, there, _mm512_load_si512(index), x, 4);
+}
 V vf v_bytes(const uint8_t *p, int n)
 {
     const v_mask there = (v_mask)(n >= LANES ? 0xffff : (1u << n) - 1);
@@ -122,6 +137,7 @@ V void add_up(const vf *x, int n, float *sums)
 
 static const struct kernels table = {
     "avx512", gather, shade, shade_jacobian, brute_jacobian, irradiance, shade_jacobian_views,
+    shade_affine, shade_setup, irradiance_setup,
 };
 const struct kernels *const kernels_avx512_table = &table;
 #else

@@ -1,7 +1,8 @@
 // solver/kernels/kernels_body.h - the float kernels, written once over a vector type; each instruction set's file defines
 //   vf, LANES floats (LANES divides KERNEL_WIDTH), and vd, half as many doubles;
-//   v_set1 v_load v_store v_max v_fma(a,b,c) = ab+c, v_rcp, v_rsqrt_sqrt (returns 1/sqrt, stores sqrt);
-//   v_mask: v_positive(x, bits) v_count v_compress; v_keep v_bytes add_up; d_set1 d_fma d_fnma(a,b,c) = c-ab d_wide(x, half) d_narrow(a, b)
+//   v_set1 v_load v_store v_max v_fma(a,b,c) = ab+c, v_fnma(a,b,c) = c-ab, v_rcp, v_rsqrt_sqrt (returns 1/sqrt, stores sqrt);
+//   v_mask: v_positive(x, bits) v_count v_compress v_compress_index(p, first, mask); v_gather v_scatter v_keep v_bytes add_up;
+//   d_set1 d_fma d_fnma d_wide(x, half) d_narrow(a, b)
 // and includes this file.
 //
 // Light and view directions are in the surface's own frame (x, y, n), where the horizon is a sign and alpha is diagonal.
@@ -17,9 +18,16 @@
 //
 // 27 sums per sample carry everything (SOLVER.md 6): Fd, ss, FH, GD(1-FH), GD FH, coat, by roughness, by anisotropic, by gloss,
 // each x RGB. Sums are taken per block of BLOCK lights, then over the blocks, so that thousands of lights cost no digits.
+//
+// By the set-up: with u = d + q e, e = c-p, |u| = <l,d> + q <l,e>, W_c the light's weight and F_c = nl f_c, two vectors per channel carry
+// everything: the turn r_c = W_c/nl l x grad F_c, for which F need not be known off the sphere, and
+//   dL_c/du = G_c = 1/|u| [W_c f_c (d/<l,d> - 3 l) + r_c x l],  dL_c/dq = <G_c,e>,  dL_c/dc = sum q G_c,
+//   dL_c/dw = sum r_c - e x dL_c/dc: the set-up turns about p, and the centre goes back.
+// |s|^2 has gradient 2s; sharp lobes are kept as vectors until the cross product, as their s and n parts cancel.
 #include "solver/kernels/kernels.h"
 
 #include <math.h>
+#include <string.h>
 
 enum { BLOCK = 1024 };
 #define SHARP .07f
@@ -167,9 +175,12 @@ INLINE void half_vector(vf *sx, vf *sy, vf *sz, const struct constants *k, const
         *sx += l->lx_rest + v_set1(k->vx_rest), *sy += l->ly_rest + v_set1(k->vy_rest);
 }
 
-// The value alone: base[c] is what the diffuse lobe is multiplied by, sheen[c] what FH is.
-INLINE void shade_light(vf sum[3], const struct constants *k, const struct light_vector *l, bool sharp,
-                        const float base[3], const float sheen[3], bool subsurface, bool coat)
+// What f consists of, without the factors that differ between the channels.
+struct lobes {
+    vf diffuse, fh, gdn, rest; // mix(Fd, ss); FH; GD (1-FH), of which a channel takes F0; GD FH + coat
+};
+
+INLINE struct lobes lobes_of(const struct constants *k, const struct light_vector *l, bool sharp, bool subsurface, bool coat)
 {
     const vf one = v_set1(1);
     vf sx, sy, sz;
@@ -192,16 +203,36 @@ INLINE void shade_light(vf sum[3], const struct constants *k, const struct light
     vf root;
     v_rsqrt_sqrt(root2, &root);
     const vf gd = d * d * v_rcp(l->nl + root) * v_set1(k->scale_gd);
-    vf gdf = gd * fh;
-    const vf gdn = gd - gdf;
+    vf rest = gd * fh;
+    const vf gdn = gd - rest;
     if (coat) {
         const vf dc = s2 * v_rcp(v_fma(z2, v_set1(k->a2), xy2));
-        gdf = v_fma(l->gc * dc, v_fma(fh, v_set1(.96f * k->scale_coat), v_set1(.04f * k->scale_coat)), gdf);
+        rest = v_fma(l->gc * dc, v_fma(fh, v_set1(.96f * k->scale_coat), v_set1(.04f * k->scale_coat)), rest);
     }
+    return (struct lobes){ diffuse, fh, gdn, rest };
+}
+
+// The value alone: base[c] is what the diffuse lobe is multiplied by, sheen[c] what FH is.
+INLINE void shade_light(vf sum[3], const struct constants *k, const struct light_vector *l, bool sharp,
+                        const float base[3], const float sheen[3], bool subsurface, bool coat)
+{
+    const struct lobes f = lobes_of(k, l, sharp, subsurface, coat);
     for (int c = 0; c < 3; c++) {
-        const vf value = v_fma(diffuse, v_set1(base[c]),
-                               v_fma(fh, v_set1(sheen[c]), v_fma(gdn, v_set1(k->f0[c]), gdf)));
+        const vf value = v_fma(f.diffuse, v_set1(base[c]),
+                               v_fma(f.fh, v_set1(sheen[c]), v_fma(f.gdn, v_set1(k->f0[c]), f.rest)));
         sum[c] = v_fma(l->w[c], value, sum[c]);
+    }
+}
+
+// sum: constant, then own. base and metallic are the shares of own; of the constant, sheen[c] is FH's and specular[c] GD (1-FH)'s.
+INLINE void affine_light(vf sum[6], const struct constants *k, const struct light_vector *l, bool sharp, float base,
+                         float metallic, const float sheen[3], const float specular[3])
+{
+    const struct lobes f = lobes_of(k, l, sharp, true, true);
+    const vf own = v_fma(f.diffuse, v_set1(base), f.gdn * v_set1(metallic));
+    for (int c = 0; c < 3; c++) {
+        const vf constant = v_fma(f.fh, v_set1(sheen[c]), v_fma(f.gdn, v_set1(specular[c]), f.rest));
+        sum[c] = v_fma(l->w[c], constant, sum[c]), sum[3 + c] = v_fma(l->w[c], own, sum[3 + c]);
     }
 }
 
@@ -294,9 +325,10 @@ static void finish(struct shade_jacobian *out, const struct sums *sums, const st
     d[DISNEY_CLEARCOAT] = coat;
     d[DISNEY_CLEARCOAT_GLOSS] = clearcoat * gloss;
     const v4 by_tint = dielectric * ilum * (sheen * sheen_tint * fh + .08f * specular * specular_tint * gdn);
-    const v4 by_self = dielectric * base + metallic * gdn + by_tint, weight = { .3f, .6f, .1f, 0 };
+    const v4 own = dielectric * base + metallic * gdn, by_self = own + by_tint, weight = { .3f, .6f, .1f, 0 };
     for (int c = 0; c < 3; c++) {
         out->L[c] = L[c];
+        out->own[c] = own[c];
         for (int i = 0; i < DISNEY_N; i++)
             out->theta[c][i] = d[i][c];
         const v4 row = by_tint[c] * -k->tint[c] * weight;
@@ -341,20 +373,28 @@ INLINE void jacobian_all(struct sums *sums, const struct lit *lit, const struct 
     }
 }
 
+// False, and all 0, when the view is below the horizon.
+static bool find_jacobian(struct shade_jacobian *out, struct constants *k, const struct lit *lit, const struct surface_point *s,
+                          const float v[3], const struct shade_material *m)
+{
+    struct sums sums = { 0 };
+    *out = (struct shade_jacobian){ 0 };
+    find_material(k, m);
+    if (!find_view(k, s, v, m))
+        return false;
+    if (k->sharp)
+        jacobian_all(&sums, lit, k, true, false);
+    else
+        jacobian_all(&sums, lit, k, false, false);
+    finish(out, &sums, k, m);
+    return true;
+}
+
 static void shade_jacobian(struct shade_jacobian *out, const struct lit *lit, const struct surface_point *s,
                            const float v[3], const struct shade_material *m)
 {
     struct constants k;
-    struct sums sums = { 0 };
-    *out = (struct shade_jacobian){ 0 };
-    find_material(&k, m);
-    if (!find_view(&k, s, v, m))
-        return;
-    if (k.sharp)
-        jacobian_all(&sums, lit, &k, true, false);
-    else
-        jacobian_all(&sums, lit, &k, false, false);
-    finish(out, &sums, &k, m);
+    find_jacobian(out, &k, lit, s, v, m);
 }
 
 static void shade_jacobian_views(struct shade_jacobian *out, int n_views, struct lit *lit, const struct surface_point *s,
@@ -428,15 +468,236 @@ static void shade(float L[3], const struct lit *lit, const struct surface_point 
         L[c] = sums[c];
 }
 
-// Eqs. 1-4 for LANES lights: direction in the surface's frame and nl max(<u,d>,0)/|u|^3, with u = d + q (centre - p).
-struct incoming {
-    vf lx, ly, nl, weight, lx_rest, ly_rest;
+INLINE void affine_all(float sums[6], const struct lit *lit, const struct constants *k, bool sharp, float base, float metallic,
+                       const float sheen[3], const float specular[3])
+{
+    for (int begin = 0; begin < lit->n; begin += BLOCK) {
+        const int end = lit->n - begin < BLOCK ? lit->n : begin + BLOCK;
+        vf sum[6];
+        for (int i = 0; i < 6; i++)
+            sum[i] = v_set1(0);
+        for (int i = begin; i < end; i += LANES) {
+            struct light_vector l;
+            load_lit(&l, lit, i, sharp);
+            affine_light(sum, k, &l, sharp, base, metallic, sheen, specular);
+        }
+        add_up(sum, 6, sums);
+    }
+}
+
+static void shade_affine(float constant[3], float own[3], const struct lit *lit, const struct surface_point *s,
+                         const float v[3], const struct shade_material *m)
+{
+    struct constants k;
+    float sums[6] = { 0 };
+    find_material(&k, m);
+    if (find_view(&k, s, v, m)) {
+        const float metallic = m->theta[DISNEY_METALLIC], dielectric = 1 - metallic;
+        float sheen[3], specular[3];
+        for (int c = 0; c < 3; c++) {
+            sheen[c] = dielectric * m->theta[DISNEY_SHEEN] * k.sheen_colour[c];
+            specular[c] = dielectric * k.f0_dielectric[c];
+        }
+        k.scale_coat *= m->theta[DISNEY_CLEARCOAT];
+        if (k.sharp)
+            affine_all(sums, lit, &k, true, dielectric * (float)M_1_PI, metallic, sheen, specular);
+        else
+            affine_all(sums, lit, &k, false, dielectric * (float)M_1_PI, metallic, sheen, specular);
+    }
+    for (int c = 0; c < 3; c++)
+        constant[c] = sums[c], own[c] = sums[3 + c];
+}
+
+// What setup_light needs beside the constants: the shares of the diffuse lobe and of FH per channel, and e = centre - p.
+struct moving {
+    float base[3], sheen[3];
+    float e[3], e_frame[3]; // in the world, in the surface's frame
 };
+enum { CENTRE = 0, TURN = 9, N_SETUP_SUMS = 18 };
+
+static struct moving find_moving(const struct light_arrays *a, const struct surface_point *s)
+{
+    struct moving m;
+    for (int c = 0; c < 3; c++)
+        m.e[c] = a->centre_m[c] - s->position_m[c];
+    m.e_frame[0] = dot3(s->tangent, m.e), m.e_frame[1] = dot3(s->bitangent, m.e), m.e_frame[2] = dot3(s->normal, m.e);
+    return m;
+}
+
+INLINE void v_cross(vf out[3], const vf a[3], const vf b[3])
+{
+    out[0] = v_fnma(a[2], b[1], a[1] * b[2]);
+    out[1] = v_fnma(a[0], b[2], a[2] * b[0]);
+    out[2] = v_fnma(a[1], b[0], a[0] * b[1]);
+}
 
 INLINE vf v_dot(const vf u[3], const float a[3])
 {
     return v_fma(u[0], v_set1(a[0]), v_fma(u[1], v_set1(a[1]), u[2] * v_set1(a[2])));
 }
+
+// by_q: dL/dq of these lights; sum: 3 channels x (q G) and x r.
+INLINE void setup_light(vf by_q[3], vf sum[N_SETUP_SUMS], const struct constants *k, const struct moving *moving,
+                        const struct light_vector *l, vf facing, vf q, bool sharp)
+{
+    const vf one = v_set1(1), to_light[3] = { l->lx, l->ly, l->nl };
+    vf s[3];
+    half_vector(&s[0], &s[1], &s[2], k, l, sharp);
+    const vf x2 = s[0] * s[0], y2 = s[1] * s[1], z2 = s[2] * s[2], xy2 = x2 + y2, s2 = xy2 + z2;
+    vf length;
+    const vf is = v_rsqrt_sqrt(s2, &length), is2 = is * is;
+
+    // x_s: the gradient of x has the part x_s s; x_n: the part x_n n.
+    const vf m = v_fma(length, v_set1(-.5f), one), m4 = m * m * (m * m), fh = m4 * m, fh_s = m4 * is * v_set1(-2.5f);
+    const vf ml = one - l->nl, sl_n = ml * ml * (ml * ml) * v_set1(-5), sv = v_set1(k->sv);
+    const vf f = s2 * v_set1(k->r4), e = v_fma(f, v_set1(2), v_set1(-.5f)), u = f - one;
+    const vf a = v_fma(e, l->sl, one), b = v_fma(e, sv, one);
+    const vf a_ss = v_fma(u, l->sl, one), b_ss = v_fma(u, sv, one), fss = a_ss * b_ss;
+    const vf isz = v_rcp(s[2]), k_ss = (isz - v_set1(.5f)) * v_set1(1.25f);
+    const vf fd = a * b, fd_s = v_fma(l->sl, b, sv * a) * v_set1(2), fd_n = e * b * sl_n;
+    const vf ss = v_fma(fss, k_ss, v_set1(.625f)), ss_s = k_ss * v_fma(l->sl, b_ss, sv * a_ss);
+    const vf ss_n = v_fma(k_ss * sl_n, u * b_ss, fss * isz * isz * v_set1(-1.25f));
+    const vf subsurface = v_set1(k->subsurface);
+    const vf diffuse = v_fma(subsurface, ss - fd, fd), diffuse_n = v_fma(subsurface, ss_n - fd_n, fd_n);
+    const vf diffuse_s = v_fma(subsurface, ss_s - fd_s, fd_s) * v_set1(2 * k->r4);
+
+    // G D and the gradient of its logarithm.
+    const vf ip = v_rcp(v_fma(x2, v_set1(k->ix2), v_fma(y2, v_set1(k->iy2), z2))), d = s2 * ip;
+    const vf gx = l->lx * v_set1(k->gx2), gy = l->ly * v_set1(k->gy2);
+    vf root;
+    const vf iroot = v_rsqrt_sqrt(v_fma(l->nl, l->nl, v_fma(gx, l->lx, gy * l->ly)), &root);
+    const vf g = v_rcp(l->nl + root), gi = g * iroot, gd = d * d * g * v_set1(k->scale_gd), four = v_set1(4);
+    const vf ln_gd[3] = { v_fnma(gi, gx, s[0] * four * v_fnma(ip, v_set1(k->ix2), is2)),
+                          v_fnma(gi, gy, s[1] * four * v_fnma(ip, v_set1(k->iy2), is2)),
+                          v_fnma(gi, l->nl, v_fma(s[2] * four, is2 - ip, -g)) };
+
+    // coat, and its gradient but for FH's.
+    const vf ic = v_rcp(v_fma(z2, v_set1(k->a2), xy2)), two = v_set1(2);
+    const vf coat_fresnel = l->gc * s2 * ic * v_set1(k->scale_coat), coat = coat_fresnel * v_fma(fh, v_set1(.96f), v_set1(.04f));
+    const vf coat_s = coat_fresnel * v_set1(.96f) * fh_s;
+    vf coat_root;
+    const vf coat_iroot = v_rsqrt_sqrt(v_fma(l->nl * v_set1(.9375f), l->nl, v_set1(.0625f)), &coat_root);
+    const vf across = coat * two * (is2 - ic);
+    const vf ln_gc_n = l->gc * v_fma(l->nl * v_set1(.9375f), coat_iroot, one);
+    const vf by_coat[3] = { s[0] * across, s[1] * across, coat * v_fnma(v_set1(k->a2) * ic, s[2] * two, v_fma(s[2] * two, is2, -ln_gc_n)) };
+
+    const vf l_n[2] = { l->ly, -l->lx }; // l x n; its third is 0
+    vf l_s[3], l_gd[3], l_coat[3];
+    v_cross(l_s, to_light, s), v_cross(l_gd, to_light, ln_gd), v_cross(l_coat, to_light, by_coat);
+
+    const vf q_e = q * v_dot(to_light, moving->e_frame), distance = v_max(facing + q_e, v_set1(1e-6f));
+    const vf iu = v_rcp(distance), i_facing = v_rcp(facing), inl = v_rcp(l->nl);
+    const vf along = v_fma(distance, i_facing, v_set1(-3)), back = q * i_facing, q_iu = q * iu;
+    vf emission[3]; // d/<l,d> - 3 l
+    for (int j = 0; j < 3; j++)
+        emission[j] = v_fnma(back, v_set1(moving->e_frame[j]), along * to_light[j]);
+    const vf not_fh = one - fh;
+    for (int c = 0; c < 3; c++) {
+        const vf base = v_set1(moving->base[c]), sheen = v_set1(moving->sheen[c]), f0 = v_set1(k->f0[c]);
+        const vf gd_fresnel = gd * v_fma(f0, not_fh, fh);
+        const vf value = v_fma(base, diffuse, v_fma(sheen, fh, gd_fresnel + coat));
+        const vf by_n = v_fma(base, diffuse_n, value * inl);
+        const vf by_s = v_fma(base, diffuse_s, v_fma(v_fnma(gd, f0, gd + sheen), fh_s, coat_s));
+        const vf w = l->w[c], w_value = w * value;
+        vf turn[3], across_l[3], by_u[3];
+        for (int j = 0; j < 3; j++) {
+            vf t = v_fma(by_s, l_s[j], v_fma(gd_fresnel, l_gd[j], l_coat[j]));
+            if (j < 2)
+                t = v_fma(by_n, l_n[j], t);
+            turn[j] = w * t;
+            sum[TURN + 3 * c + j] += turn[j];
+        }
+        v_cross(across_l, turn, to_light);
+        for (int j = 0; j < 3; j++) {
+            by_u[j] = v_fma(w_value, emission[j], across_l[j]);
+            sum[CENTRE + 3 * c + j] = v_fma(q_iu, by_u[j], sum[CENTRE + 3 * c + j]);
+        }
+        by_q[c] = iu * v_dot(by_u, moving->e_frame);
+    }
+}
+
+INLINE void setup_all(struct shade_setup *setup, float sums[N_SETUP_SUMS], const struct lit *lit, const struct light_arrays *a,
+                      const struct constants *k, const struct moving *moving, bool sharp)
+{
+    for (int begin = 0; begin < lit->n; begin += BLOCK) {
+        const int end = lit->n - begin < BLOCK ? lit->n : begin + BLOCK;
+        vf sum[N_SETUP_SUMS];
+        for (int i = 0; i < N_SETUP_SUMS; i++)
+            sum[i] = v_set1(0);
+        for (int i = begin; i < end; i += LANES) {
+            struct light_vector l;
+            vf by_q[3];
+            load_lit(&l, lit, i, sharp);
+            setup_light(by_q, sum, k, moving, &l, v_load(lit->facing + i), v_gather(a->q, lit->index + i), sharp);
+            for (int c = 0; c < 3; c++)
+                v_scatter(setup->inverse_distance[c], lit->index + i, by_q[c], lit->n - i);
+        }
+        add_up(sum, N_SETUP_SUMS, sums);
+    }
+}
+
+static void cross3(float out[3], const float a[3], const float b[3])
+{
+    for (int c = 0; c < 3; c++)
+        out[c] = a[(c + 1) % 3] * b[(c + 2) % 3] - a[(c + 2) % 3] * b[(c + 1) % 3];
+}
+
+// dL/dw from the turn about the point.
+static void turn_about_centre(float rotation[3], const float turn[3], const float e[3], const float centre[3])
+{
+    float shift[3];
+    cross3(shift, e, centre);
+    for (int j = 0; j < 3; j++)
+        rotation[j] = turn[j] - shift[j];
+}
+
+// From the surface's frame to the world, where a cross product has the frame's hand.
+static void finish_setup(struct shade_setup *setup, const float sums[N_SETUP_SUMS], const struct moving *moving,
+                         const struct surface_point *s)
+{
+    float third[3];
+    cross3(third, s->tangent, s->bitangent);
+    const float hand = dot3(third, s->normal) < 0 ? -1 : 1;
+    for (int c = 0; c < 3; c++) {
+        const float *q_g = sums + CENTRE + 3 * c, *r = sums + TURN + 3 * c;
+        float turn[3];
+        for (int j = 0; j < 3; j++) {
+            setup->centre[c][j] = q_g[0] * s->tangent[j] + q_g[1] * s->bitangent[j] + q_g[2] * s->normal[j];
+            turn[j] = hand * (r[0] * s->tangent[j] + r[1] * s->bitangent[j] + r[2] * s->normal[j]);
+        }
+        turn_about_centre(setup->rotation[c], turn, moving->e, setup->centre[c]);
+    }
+}
+
+static void shade_setup(struct shade_jacobian *out, struct shade_setup *setup, const struct lit *lit,
+                        const struct light_arrays *a, const struct surface_point *s, const float v[3],
+                        const struct shade_material *m)
+{
+    struct constants k;
+    struct moving moving = find_moving(a, s);
+    float sums[N_SETUP_SUMS] = { 0 };
+    for (int c = 0; c < 3; c++)
+        memset(setup->inverse_distance[c], 0, (size_t)a->n_padded * sizeof(float));
+    if (find_jacobian(out, &k, lit, s, v, m)) {
+        const float dielectric = 1 - m->theta[DISNEY_METALLIC];
+        for (int c = 0; c < 3; c++) {
+            moving.base[c] = dielectric * m->albedo[c] * (float)M_1_PI;
+            moving.sheen[c] = dielectric * m->theta[DISNEY_SHEEN] * k.sheen_colour[c];
+        }
+        k.scale_coat *= m->theta[DISNEY_CLEARCOAT];
+        if (k.sharp)
+            setup_all(setup, sums, lit, a, &k, &moving, true);
+        else
+            setup_all(setup, sums, lit, a, &k, &moving, false);
+    }
+    finish_setup(setup, sums, &moving, s);
+}
+
+// Eqs. 1-4 for LANES lights: direction in the surface's frame and nl max(<u,d>,0)/|u|^3, with u = d + q (centre - p).
+struct incoming {
+    vf lx, ly, nl, weight, lx_rest, ly_rest;
+    vf u[3], d[3], q, iu /* 1/|u| */, facing /* <l,d> */;
+};
 
 INLINE vd d_dot(const vd u[3], const float a[3])
 {
@@ -476,6 +737,10 @@ INLINE struct incoming light_at(const struct light_arrays *a, int i, const struc
     const vf nl = iu * v_dot(u, s->normal);
     in.weight = v_max(nl, v_set1(0)) * ud * (iu * iu * iu);
     in.nl = v_max(nl, v_set1(1e-10f)); // so that nothing divides by 0, whatever the weight
+    in.facing = v_max(ud * iu, v_set1(1e-10f));
+    in.q = q, in.iu = iu;
+    for (int c = 0; c < 3; c++)
+        in.u[c] = u[c], in.d[c] = d[c];
     return in;
 }
 
@@ -497,16 +762,19 @@ static void gather(struct lit *out, const struct light_arrays *a, const struct s
         v_compress(out->lx + n, in.lx, keep), v_compress(out->ly + n, in.ly, keep);
         v_compress(out->lx_rest + n, in.lx_rest, keep), v_compress(out->ly_rest + n, in.ly_rest, keep);
         v_compress(out->nl + n, in.nl, keep);
+        v_compress(out->facing + n, in.facing, keep);
         v_compress(out->wr + n, in.weight * v_load(a->cr + i), keep);
         v_compress(out->wg + n, in.weight * v_load(a->cg + i), keep);
         v_compress(out->wb + n, in.weight * v_load(a->cb + i), keep);
+        v_compress_index(out->index + n, i, keep);
         n += v_count(keep);
     }
     out->n = n;
     for (int i = n; i % KERNEL_WIDTH; i++) {
         out->lx[i] = out->ly[i] = out->lx_rest[i] = out->ly_rest[i] = 0;
         out->wr[i] = out->wg[i] = out->wb[i] = 0;
-        out->nl[i] = 1;
+        out->nl[i] = out->facing[i] = 1;
+        out->index[i] = 0;
     }
     for (int i = 0; i < n; i += LANES) {
         const vf nl = v_load(out->nl + i);
@@ -568,4 +836,47 @@ static void irradiance(float E[3], const struct light_arrays *a, const struct su
     }
     for (int c = 0; c < 3; c++)
         E[c] = sums[c];
+}
+
+// In the world's frame, as f = 1 needs none: with a = <l,d>, G = C V/|u|^3 [nl d + a n - 4 nl a l], and the turn is C V a/|u|^2 l x n.
+static void irradiance_setup(float E[3], struct shade_setup *setup, const struct light_arrays *a, const struct surface_point *s,
+                             const uint16_t *visible)
+{
+    enum { BY_C = 3, L_SUM = 12, N = 21 };
+    const struct moving moving = find_moving(a, s);
+    float sums[N] = { 0 };
+    for (int begin = 0; begin < a->n_padded; begin += BLOCK) {
+        const int end = a->n_padded - begin < BLOCK ? a->n_padded : begin + BLOCK;
+        vf sum[N];
+        for (int i = 0; i < N; i++)
+            sum[i] = v_set1(0);
+        for (int i = begin; i < end; i += LANES) {
+            const struct incoming in = light_at(a, i, s, false);
+            const unsigned keep = (unsigned)v_positive(in.weight, visible_bits(visible, i));
+            const vf w = v_keep(in.weight, keep), g = v_keep(in.facing * in.iu * in.iu, keep), iu3 = v_keep(in.iu * in.iu * in.iu, keep);
+            const vf to_l = in.nl * in.facing * in.iu * v_set1(-4);
+            vf by_u[3], l[3];
+            for (int j = 0; j < 3; j++) {
+                by_u[j] = iu3 * v_fma(in.nl, in.d[j], v_fma(in.facing, v_set1(s->normal[j]), to_l * in.u[j]));
+                l[j] = g * in.iu * in.u[j];
+            }
+            const vf by_q = v_dot(by_u, moving.e), colour[3] = { v_load(a->cr + i), v_load(a->cg + i), v_load(a->cb + i) };
+            for (int c = 0; c < 3; c++) {
+                sum[c] = v_fma(w, colour[c], sum[c]);
+                v_store(setup->inverse_distance[c] + i, colour[c] * by_q);
+                for (int j = 0; j < 3; j++) {
+                    sum[BY_C + 3 * c + j] = v_fma(in.q * by_u[j], colour[c], sum[BY_C + 3 * c + j]);
+                    sum[L_SUM + 3 * c + j] = v_fma(l[j], colour[c], sum[L_SUM + 3 * c + j]);
+                }
+            }
+        }
+        add_up(sum, N, sums);
+    }
+    for (int c = 0; c < 3; c++) {
+        float turn[3];
+        E[c] = sums[c];
+        memcpy(setup->centre[c], sums + BY_C + 3 * c, sizeof(setup->centre[c]));
+        cross3(turn, sums + L_SUM + 3 * c, s->normal);
+        turn_about_centre(setup->rotation[c], turn, moving.e, setup->centre[c]);
+    }
 }

@@ -27,6 +27,10 @@ V vf v_fma(vf a, vf b, vf c)
 {
     return a * b + c;
 }
+V vf v_fnma(vf a, vf b, vf c)
+{
+    return c - a * b;
+}
 V vf v_max(vf a, vf b)
 {
     const vi more = a > b;
@@ -88,6 +92,23 @@ V void v_compress(float *p, vf x, v_mask m)
         p += m >> i & 1;
     }
 }
+V void v_compress_index(int32_t *p, int first, v_mask m)
+{
+    for (int i = 0; i < LANES; i++) {
+        *p = first + i;
+        p += m >> i & 1;
+    }
+}
+V vf v_gather(const float *p, const int32_t *index)
+{
+    return (vf){ p[index[0]], p[index[1]], p[index[2]], p[index[3]] };
+}
+// The first n lanes.
+V void v_scatter(float *p, const int32_t *index, vf x, int n)
+{
+    for (int i = 0; i < LANES && i < n; i++)
+        p[index[i]] = x[i];
+}
 V vf v_bytes(const uint8_t *p, int n)
 {
     vf x = v_set1(0);
@@ -107,4 +128,5 @@ V void add_up(const vf *x, int n, float *sums)
 
 const struct kernels kernels_portable_table = {
     "portable", gather, shade, shade_jacobian, brute_jacobian, irradiance, shade_jacobian_views,
+    shade_affine, shade_setup, irradiance_setup,
 };

@@ -31,6 +31,10 @@ struct texel {
 
 static struct light_arrays lights;
 static struct lit lit;
+static _Alignas(64) float by_inverse_distance[3][N_LIGHTS];
+static struct shade_setup setup = {
+    .inverse_distance = { by_inverse_distance[0], by_inverse_distance[1], by_inverse_distance[2] },
+};
 static struct texel texels[N_TEXELS];
 static volatile float sink;
 
@@ -87,7 +91,7 @@ static void build_studio(void)
     }
 }
 
-enum way { BRUTE, SHARED, VIEWS, VALUE, GATHER, PEER_PLAIN, PEER_FIXED, PEER_CAREFUL };
+enum way { BRUTE, SHARED, VIEWS, VALUE, AFFINE, SETUP, GATHER, PEER_PLAIN, PEER_FIXED, PEER_CAREFUL };
 struct method {
     const char *kernel, *what;
     enum way way;
@@ -107,10 +111,16 @@ static struct method methods[] = {
     { "avx512", "gathered per texel, exact", SHARED, N_TEXELS, N_VIEWS, { 0 }, 0 },
     { "portable", "shared by all views, exact", VIEWS, 32, N_VIEWS, { 0 }, 0 },
     { "portable", "shared, value only", VALUE, 32, N_VIEWS, { 0 }, 0 },
+    { "portable", "shared, affine in albedo", AFFINE, 32, N_VIEWS, { 0 }, 0 },
+    { "portable", "shared, and by the set-up", SETUP, 32, N_VIEWS, { 0 }, 0 },
     { "avx2", "shared by all views, exact", VIEWS, N_TEXELS, N_VIEWS, { 0 }, 0 },
     { "avx2", "shared, value only", VALUE, N_TEXELS, N_VIEWS, { 0 }, 0 },
+    { "avx2", "shared, affine in albedo", AFFINE, N_TEXELS, N_VIEWS, { 0 }, 0 },
+    { "avx2", "shared, and by the set-up", SETUP, N_TEXELS, N_VIEWS, { 0 }, 0 },
     { "avx512", "shared by all views, exact", VIEWS, N_TEXELS, N_VIEWS, { 0 }, 0 },
     { "avx512", "shared, value only", VALUE, N_TEXELS, N_VIEWS, { 0 }, 0 },
+    { "avx512", "shared, affine in albedo", AFFINE, N_TEXELS, N_VIEWS, { 0 }, 0 },
+    { "avx512", "shared, and by the set-up", SETUP, N_TEXELS, N_VIEWS, { 0 }, 0 },
     { "portable", "gather alone, 1 view", GATHER, N_TEXELS, 1, { 0 }, 0 },
     { "avx2", "gather alone, 1 view", GATHER, N_TEXELS, 1, { 0 }, 0 },
     { "avx512", "gather alone, 1 view", GATHER, N_TEXELS, 1, { 0 }, 0 },
@@ -150,7 +160,8 @@ static double run(const struct method *m)
     const double begin = cpu_s();
     for (int t = 0; t < m->n_texels; t++) {
         const struct texel *texel = &texels[t];
-        if (m->way == SHARED || m->way == VIEWS || m->way == VALUE || m->way == GATHER)
+        if (m->way == SHARED || m->way == VIEWS || m->way == VALUE || m->way == AFFINE || m->way == SETUP ||
+            m->way == GATHER)
             k->gather(&lit, &lights, &texel->surface, NULL, NULL);
         if (m->way == VIEWS) {
             struct shade_jacobian j[N_VIEWS];
@@ -166,6 +177,10 @@ static double run(const struct method *m)
                 k->shade_jacobian(&j, &lit, &texel->surface, texel->view[i], &texel->material);
             else if (m->way == VALUE)
                 k->shade(j.L, &lit, &texel->surface, texel->view[i], &texel->material);
+            else if (m->way == AFFINE)
+                k->shade_affine(j.L, j.own, &lit, &texel->surface, texel->view[i], &texel->material);
+            else if (m->way == SETUP)
+                k->shade_setup(&j, &setup, &lit, &lights, &texel->surface, texel->view[i], &texel->material);
             else
                 peer(L, jacobian, (int)m->way - PEER_PLAIN, texel, texel->view[i]), j.L[0] = (float)L[0];
             sink = j.L[0];

@@ -1,0 +1,59 @@
+// solver/joint.h - stage 1: from what the cameras measured and one roughly aligned panorama to the set-up of the lights (c, R, every
+// distance), one shared reflectance and per-texel albedo. Three methods behind one interface:
+//
+//   METHOD_DIRECTIONAL  all lights at infinity; the baseline
+//   METHOD_ALTERNATING  the paper: albedo from dark samples and (theta, c, R, r_i) from bright ones in turn, fixed w_sim (Eqs. 8-12)
+//   METHOD_JOINT        ours: albedo eliminated, 1/r, a coarse sweep for the start, continuation in w_sim stopped by views set aside
+//                       (SOLVER.md 4)
+#pragma once
+#include "solver/photometric.h"
+#include "solver/rays.h"
+
+enum method { METHOD_JOINT, METHOD_ALTERNATING, METHOD_DIRECTIONAL };
+extern const char *const method_names[3]; // "joint", "alternating", "directional"
+
+struct joint_settings {
+    enum method method;
+    enum reflectance model;
+    enum disney_variant variant;
+    enum albedo_mode albedo;
+    double given_albedo[3];  // ALBEDO_GIVEN
+    double start_distance_m; // of every light; 0: swept over .7 .. 4 m (joint)
+    double w_sim;            // alternating: weight of Eq. 11 beside the *sum* of squared residuals (paper). joint: the last weight of the
+                             // continuation, beside the *mean*; negative: stopped by the views set aside (default)
+    bool visibility;         // trace shadows, and again when lights have moved
+    bool robust;             // down-weight outliers in the last stage
+    bool gain;               // one unknown exposure factor per camera (prior 2 %)
+    int n_threads;
+};
+struct joint_settings joint_defaults(enum method method);
+
+enum joint_doubt { // why an answer is not to be trusted; bits
+    DOUBT_NO_INFORMATION = 1, // diffuse with free albedo: nothing says how far the lights are
+    DOUBT_FEW_VIEWS = 2,      // fewer than 3 views see the object
+    DOUBT_MIRRORED = 4,       // the mirrored panorama explains the pictures better
+    DOUBT_UNCERTAIN = 8,      // the standard deviation of the centre is above 10 cm, or the distances' median above 15 %
+    DOUBT_POOR_FIT = 16,      // the residual is far above the noise: a light is missing, or something moved
+};
+const char *joint_doubt_text(unsigned one_bit);
+
+struct joint_result {
+    struct photometric_state state; // owned
+    double rmse_fit_percent, rmse_held_out_percent; // samples; -1: no view held out
+    int64_t n_fit, n_held_out;
+    int n_jacobians, n_evaluations;
+    double w_sim;                    // the last one, our normalisation (mean); w_sim_sum: the paper's (sum)
+    double w_sim_sum;
+    const char *stop_reason;
+    double theta_std[DISNEY_N], centre_std_m[3], rotation_std_rad[3];
+    double *inverse_distance_std;    // [groups] 1/m; owned
+    double objective;                // mean squared residual of the fit
+    unsigned doubts;                 // 0: trusted
+};
+
+// lights: from the panorama, with the rough set-up (centre, rotation) in it; group_of_light as in photometric.h. hold_out[n_views]: 1 = never
+// fitted, only reported. rays may be NULL (no visibility). Progress through progress.h. 0, -EINVAL (logged), -ENOMEM.
+int joint_solve(struct joint_result *out, const struct texels *texels, const struct samples *samples,
+                const struct rays *rays, const struct lights *lights, const int32_t *group_of_light, int n_groups,
+                const uint8_t *hold_out, const struct joint_settings *settings);
+void joint_result_free(struct joint_result *r);
