@@ -20,7 +20,7 @@
 
 enum { TEXTURE = 24, N_VIEWS = 7, N_LIGHTS = 20, N_GROUPS = 9, WORDS = 2, N_UNKNOWNS = DISNEY_N + 9 + N_VIEWS + N_GROUPS };
 // Kernels are float; what a row of J or a residual may be off by, relative to the column's and the residuals' norm.
-static const double float_bound = 1e-4;
+static const double float_bound = 1e-5;
 
 struct studio {
     struct mesh mesh;
@@ -80,12 +80,13 @@ static void radiance(const struct photometric *p, const struct photometric_state
 static void affine(const struct photometric *p, const struct photometric_state *s, int texel, int view, const double tint[3],
                    double constant[3], double own[3])
 {
-    const double twice[3] = { 2 * tint[0], 2 * tint[1], 2 * tint[2] };
-    double L[3], L2[3];
-    radiance(p, s, texel, view, tint, L);
+    double once[3], twice[3], L[3], L2[3];
+    for (int c = 0; c < 3; c++)
+        once[c] = fmax(tint[c], 1e-6), twice[c] = 2 * once[c];
+    radiance(p, s, texel, view, once, L);
     radiance(p, s, texel, view, twice, L2);
     for (int c = 0; c < 3; c++)
-        own[c] = (L2[c] - L[c]) / tint[c], constant[c] = 2 * L[c] - L2[c];
+        own[c] = (L2[c] - L[c]) / once[c], constant[c] = 2 * L[c] - L2[c];
 }
 
 static double observed(const struct photometric *p, int64_t i, int c)
@@ -437,12 +438,7 @@ static void measuring_leaves_the_albedo_alone(void **state)
 
 // ---- normal equations --------------------------------------------------------------------------------------------------
 
-static double step_of(const struct photometric_layout *l, int unknown)
-{
-    (void)l;
-    (void)unknown;
-    return 1e-5;
-}
+static const double difference_step = 1e-5;
 
 static void moved(const struct studio *s, const struct photometric_state *from, int unknown, double by, struct photometric_state *to)
 {
@@ -469,7 +465,7 @@ static void reference_equations(const struct studio *s, const struct photometric
     assert_true(r && plus && own && J);
     residuals(p, at, albedo, r);
     for (int u = 0; u < l.n; u++) {
-        const double h = step_of(&l, u);
+        const double h = difference_step;
         for (int side = -1; is_free[u] && side <= 1; side += 2) {
             struct photometric_state there;
             moved(s, at, u, side * h, &there);
@@ -558,7 +554,7 @@ static void equations_hold(struct studio *s)
             assert_true(g_found[u] == 0);
             continue;
         }
-        const double scale = sqrt(raw[u] * 2 * e.cost), h = step_of(&l, u);
+        const double scale = sqrt(raw[u] * 2 * e.cost), h = difference_step;
         struct photometric_state there;
         assert_true(raw[u] > 0 || u == DISNEY_SPECULAR_TINT || u == DISNEY_SHEEN_TINT);
         moved(s, &at, u, h, &there);
