@@ -556,7 +556,10 @@ static void equations_hold(struct studio *s)
         }
         const double scale = sqrt(raw[u] * 2 * e.cost), h = difference_step;
         struct photometric_state there;
-        assert_true(raw[u] > 0 || u == DISNEY_SPECULAR_TINT || u == DISNEY_SHEEN_TINT);
+        if (raw[u] == 0) { // a view left out
+            assert_true(s->p.use_view && g_found[u] == 0 && A_found[u * l.n + u] == 0);
+            continue;
+        }
         moved(s, &at, u, h, &there);
         double slope = cost_of(&s->p, &there) / (2 * h);
         photometric_state_free(&there);
@@ -586,6 +589,326 @@ static void equations_are_those_of_the_residuals(void **state)
         }
 }
 
+// Weights with zeros, views and texels left out. What is left out must not matter: it is filled with nonsense.
+struct choice {
+    uint8_t use_view[N_VIEWS];
+    float *weight;
+};
+
+static void choose(struct studio *s, struct choice *c)
+{
+    memset(c->use_view, 1, sizeof(c->use_view));
+    c->use_view[2] = c->use_view[5] = 0;
+    c->weight = malloc((size_t)s->samples.n * sizeof(float));
+    assert_non_null(c->weight);
+    s->p.use_view = c->use_view, s->p.weight = c->weight, s->p.texel_step = 3;
+    for (int t = 0; t < s->texels.n; t++)
+        for (int64_t i = s->samples.first[t]; i < s->samples.first[t + 1]; i++) {
+            c->weight[i] = (float)fmax(2 * uniform(11, (uint64_t)i) - .4, 0);
+            if (!in_use(&s->p, t, i))
+                s->samples.radiance[i][0] = s->samples.radiance[i][1] = s->samples.radiance[i][2] = half_from_float(3e4f);
+        }
+}
+
+static void what_is_left_out_does_not_count(void **state)
+{
+    (void)state;
+    for (int model = REFLECT_DISNEY; model <= REFLECT_LAMBERT; model++)
+        for (int albedo = ALBEDO_FREE; albedo <= ALBEDO_SHARED; albedo++) {
+            struct studio s;
+            struct choice c;
+            struct photometric_state wrong;
+            int64_t n = 0;
+            studio_open(&s, (enum reflectance)model, (enum albedo_mode)albedo);
+            choose(&s, &c);
+            for (int t = 0; t < s.texels.n; t++)
+                for (int64_t i = s.samples.first[t]; i < s.samples.first[t + 1]; i++)
+                    n += in_use(&s.p, t, i);
+            wrong_state(&s, &wrong);
+            const double expected = cost_of(&s.p, &wrong);
+            const struct photometric_error e = evaluate(&s.p, &wrong, true);
+            assert_int_equal(e.n, n);
+            assert_true(n > 100);
+            close_to(e.cost, expected, float_bound * expected);
+            photometric_state_free(&wrong);
+            equations_hold(&s);
+            free(c.weight);
+            studio_close(&s);
+        }
+}
+
+// Every sample but a texel's first may be clipped at a share of what was there.
+static void clip_some(struct studio *s)
+{
+    for (int t = 0; t < s->texels.n; t++)
+        for (int64_t i = s->samples.first[t] + 1; i < s->samples.first[t + 1]; i++) {
+            if (uniform(12, (uint64_t)i) > .5)
+                continue;
+            s->samples.flags[i] |= SAMPLE_CLIPPED;
+            for (int c = 0; c < 3; c++)
+                s->samples.radiance[i][c] =
+                    half_from_float((float)((.5 + .5 * uniform(13, (uint64_t)i)) * observed(&s->p, i, c)));
+        }
+}
+
+static void clipped_samples_are_lower_bounds(void **state)
+{
+    (void)state;
+    for (int model = REFLECT_DISNEY; model <= REFLECT_LAMBERT; model++)
+        for (int albedo = ALBEDO_FREE; albedo <= ALBEDO_SHARED; albedo++) {
+            struct studio s;
+            struct photometric_state wrong;
+            studio_open(&s, (enum reflectance)model, (enum albedo_mode)albedo);
+            clip_some(&s);
+            wrong_state(&s, &wrong);
+            const double expected = cost_of(&s.p, &wrong);
+            const struct photometric_error e = evaluate(&s.p, &wrong, true);
+            close_to(e.cost, expected, float_bound * expected);
+            photometric_state_free(&wrong);
+            equations_hold(&s);
+            studio_close(&s);
+        }
+}
+
+// ... whichever side of the bound the search starts on.
+static void clipped_samples_do_not_pull_the_albedo(void **state)
+{
+    (void)state;
+    static const float starts[] = { .01f, .3f, 1.4f };
+    for (int model = REFLECT_DISNEY; model <= REFLECT_LAMBERT; model++)
+        for (int k = 0; k < 3; k++) {
+            struct studio s;
+            struct photometric_state start;
+            studio_open(&s, (enum reflectance)model, ALBEDO_FREE);
+            clip_some(&s);
+            new_copy(&s, &start, &s.truth);
+            for (int t = 0; t < s.texels.n; t++)
+                start.albedo[t][0] = start.albedo[t][1] = start.albedo[t][2] = starts[k];
+            evaluate(&s.p, &start, true);
+            for (int t = 0; t < s.texels.n; t++)
+                for (int c = 0; c < 3 && s.samples.first[t + 1] > s.samples.first[t]; c++)
+                    close_to((double)start.albedo[t][c], (double)s.truth.albedo[t][c], 2e-3);
+            photometric_state_free(&start);
+            studio_close(&s);
+        }
+}
+
+static void equations_are_added_to_what_is_there(void **state)
+{
+    (void)state;
+    struct studio s;
+    struct photometric_state at;
+    unsigned char is_free[N_UNKNOWNS], some[N_UNKNOWNS];
+    double A[N_UNKNOWNS * N_UNKNOWNS] = { 0 }, g[N_UNKNOWNS] = { 0 }, A2[N_UNKNOWNS * N_UNKNOWNS], g2[N_UNKNOWNS];
+    studio_open(&s, REFLECT_DISNEY, ALBEDO_GIVEN);
+    wrong_state(&s, &at);
+    choose_free(&s.p, is_free);
+    const struct photometric_error e = evaluate(&s.p, &at, true);
+    assert_int_equal(photometric_normal_equations(&s.p, &at, is_free, A, g), 0);
+    for (int u = 0; u < N_UNKNOWNS; u++) {
+        some[u] = is_free[u] && u % 3 != 1;
+        g2[u] = 5;
+        for (int w = 0; w < N_UNKNOWNS; w++)
+            A2[u * N_UNKNOWNS + w] = 7;
+    }
+    assert_int_equal(photometric_normal_equations(&s.p, &at, some, A2, g2), 0);
+    for (int u = 0; u < N_UNKNOWNS; u++) {
+        const double norm = sqrt(A[u * N_UNKNOWNS + u]);
+        close_to(g2[u], 5 + (some[u] ? g[u] : 0), float_bound * norm * sqrt(2 * e.cost));
+        for (int w = 0; w < N_UNKNOWNS; w++)
+            close_to(A2[u * N_UNKNOWNS + w], 7 + (some[u] && some[w] && w <= u ? A[u * N_UNKNOWNS + w] : 0),
+                     float_bound * norm * sqrt(A[w * N_UNKNOWNS + w]));
+    }
+    memset(some, 0, sizeof(some));
+    memcpy(A, A2, sizeof(A));
+    assert_int_equal(photometric_normal_equations(&s.p, &at, some, A2, g2), 0); // nothing free: nothing added
+    assert_memory_equal(A, A2, sizeof(A));
+    photometric_state_free(&at);
+    studio_close(&s);
+}
+
+// With a tint the equations hold it: the gradient is not exact, but downhill it must point, and nearly so near the solution.
+static void tinted_gradients_point_downhill(void **state)
+{
+    (void)state;
+    for (int k = 0; k < 3; k++) {
+        struct studio s;
+        struct photometric_state at, there;
+        unsigned char is_free[N_UNKNOWNS];
+        double A[N_UNKNOWNS * N_UNKNOWNS] = { 0 }, g[N_UNKNOWNS] = { 0 }, x[N_UNKNOWNS], promised = 0;
+        studio_open(&s, REFLECT_DISNEY, ALBEDO_FREE);
+        s.truth.theta[DISNEY_SPECULAR_TINT] = s.truth.theta[DISNEY_SHEEN_TINT] = k == 0 ? .2 : k == 1 ? .5 : .9;
+        photograph(&s, .05);
+        wrong_state(&s, &at);
+        choose_free(&s.p, is_free);
+        evaluate(&s.p, &at, true);
+        const struct photometric_error before = evaluate(&s.p, &at, true); // the second time at its tint
+        assert_int_equal(photometric_normal_equations(&s.p, &at, is_free, A, g), 0);
+        photometric_pack(&s.p, &at, x);
+        for (int u = 0; u < N_UNKNOWNS; u++) {
+            const double step = A[u * N_UNKNOWNS + u] > 0 ? -1e-3 * g[u] / A[u * N_UNKNOWNS + u] : 0;
+            x[u] += step, promised -= g[u] * step;
+        }
+        new_copy(&s, &there, &at);
+        photometric_unpack(&s.p, &there, x);
+        const double gain = before.cost - evaluate(&s.p, &there, true).cost;
+        print_message("# tint %.1f: a short step gains %.3f of what the gradient promises\n", s.truth.theta[DISNEY_SHEEN_TINT],
+                      gain / promised);
+        assert_true(gain > 0);
+        photometric_state_free(&there);
+        photometric_state_free(&at);
+        studio_close(&s);
+    }
+}
+
+// ---- the state ---------------------------------------------------------------------------------------------------------
+
+static void packing_comes_back(void **state)
+{
+    (void)state;
+    struct studio s;
+    struct photometric_state a, b;
+    const struct photometric_layout l = photometric_layout_of(N_VIEWS, N_GROUPS);
+    double x[N_UNKNOWNS], y[N_UNKNOWNS];
+    studio_open(&s, REFLECT_DISNEY, ALBEDO_SHARED);
+    assert_int_equal(photometric_state_new(&a, &s.p, &s.lights), 0);
+    assert_true(a.lights.dir_probe != s.lights.dir_probe && a.theta[3] == .5 && a.albedo[1][2] == .5f && a.log_gain[1] == 0);
+    assert_memory_equal(a.lights.dir_probe, s.lights.dir_probe, N_LIGHTS * sizeof(*a.lights.dir_probe));
+    assert_memory_equal(a.lights.irradiance, s.lights.irradiance, N_LIGHTS * sizeof(*a.lights.irradiance));
+    for (int i = 0; i < l.n; i++)
+        x[i] = .01 * (i + 1);
+    x[l.rotation] = x[l.rotation + 1] = x[l.rotation + 2] = 0;
+    photometric_unpack(&s.p, &a, x);
+    assert_memory_equal(a.lights.world_from_probe, s.lights.world_from_probe, sizeof(a.lights.world_from_probe));
+    photometric_pack(&s.p, &a, y);
+    assert_memory_equal(x, y, sizeof(x));
+    for (int i = 0; i < N_LIGHTS; i++)
+        assert_true(a.lights.inverse_distance[i] == x[l.inverse_distance + s.group[i]]);
+    assert_true(a.theta[DISNEY_ROUGHNESS] == x[DISNEY_ROUGHNESS] && a.lights.centre_m[2] == x[l.centre + 2]);
+    assert_true(a.shared_albedo[1] == x[l.albedo + 1] && a.log_gain[3] == x[l.gain + 3]);
+
+    // Two turns, the second on the left.
+    const double turns[2][3] = { { .3, -.2, .5 }, { -.1, .7, .2 } };
+    double expected[9], turn[9];
+    memcpy(expected, s.lights.world_from_probe, sizeof(expected));
+    for (int k = 0; k < 2; k++) {
+        photometric_pack(&s.p, &a, x);
+        assert_true(x[l.rotation] == 0 && x[l.rotation + 1] == 0 && x[l.rotation + 2] == 0);
+        memcpy(x + l.rotation, turns[k], sizeof(turns[k]));
+        photometric_unpack(&s.p, &a, x);
+        mat3_from_rotation_vector(turn, turns[k]);
+        mat3_mul(expected, turn, expected);
+    }
+    for (int i = 0; i < 9; i++)
+        close_to(a.lights.world_from_probe[i], expected[i], 1e-15);
+
+    // A copy is the same to the last byte that packing and evaluation see.
+    a.albedo[3][1] = .123f;
+    assert_int_equal(photometric_state_new(&b, &s.p, &s.lights), 0);
+    photometric_state_copy(&s.p, &b, &a);
+    photometric_pack(&s.p, &a, x);
+    photometric_pack(&s.p, &b, y);
+    assert_memory_equal(x, y, sizeof(x));
+    assert_memory_equal(a.lights.world_from_probe, b.lights.world_from_probe, sizeof(a.lights.world_from_probe));
+    assert_memory_equal(a.albedo, b.albedo, (size_t)s.texels.n * sizeof(*a.albedo));
+    photometric_state_free(&a);
+    photometric_state_free(&b);
+    studio_close(&s);
+}
+
+static void threads_give_the_same_bytes(void **state)
+{
+    (void)state;
+    for (int albedo = ALBEDO_FREE; albedo <= ALBEDO_SHARED; albedo++) {
+        struct studio s;
+        struct photometric_state wrong, at;
+        struct photometric_error e[3];
+        double A[3][N_UNKNOWNS * N_UNKNOWNS] = { 0 }, g[3][N_UNKNOWNS] = { 0 }, sigma[3];
+        unsigned char is_free[N_UNKNOWNS];
+        studio_open(&s, REFLECT_DISNEY, (enum albedo_mode)albedo);
+        wrong_state(&s, &wrong);
+        choose_free(&s.p, is_free);
+        const size_t bytes = (size_t)s.texels.n * sizeof(*wrong.albedo), n = (size_t)s.samples.n;
+        float(*first)[3] = malloc(bytes), *weight = malloc(2 * n * sizeof(float));
+        assert_true(first && weight);
+        for (int k = 0; k < 3; k++) {
+            s.p.n_threads = k == 0 ? 1 : k == 1 ? 3 : 16;
+            new_copy(&s, &at, &wrong);
+            e[k] = evaluate(&s.p, &at, true);
+            assert_int_equal(photometric_normal_equations(&s.p, &at, is_free, A[k], g[k]), 0);
+            assert_int_equal(photometric_scale(&s.p, &at, &sigma[k]), 0);
+            assert_int_equal(photometric_robust_weights(&s.p, &at, sigma[k], NULL, weight + (k ? n : 0)), 0);
+            if (k == 0)
+                memcpy(first, at.albedo, bytes);
+            assert_memory_equal(first, at.albedo, bytes);
+            assert_memory_equal(&e[0], &e[k], sizeof(e[0]));
+            assert_memory_equal(A[0], A[k], sizeof(A[0]));
+            assert_memory_equal(g[0], g[k], sizeof(g[0]));
+            assert_true(sigma[0] == sigma[k]);
+            assert_memory_equal(weight, weight + (k ? n : 0), n * sizeof(float));
+            photometric_state_free(&at);
+        }
+        free(first);
+        free(weight);
+        photometric_state_free(&wrong);
+        studio_close(&s);
+    }
+}
+
+// ---- robust weights ----------------------------------------------------------------------------------------------------
+
+static int by_double(const void *a, const void *b)
+{
+    const double x = *(const double *)a, y = *(const double *)b;
+    return (x > y) - (x < y);
+}
+
+static void robust_weights_are_geman_mcclures(void **state)
+{
+    (void)state;
+    struct studio s;
+    struct choice choice;
+    struct photometric_state at;
+    studio_open(&s, REFLECT_DISNEY, ALBEDO_GIVEN);
+    photograph(&s, .1);
+    choose(&s, &choice);
+    new_copy(&s, &at, &s.truth);
+    const size_t n = (size_t)s.samples.n;
+    double(*r)[3] = malloc(n * sizeof(*r)), (*albedo)[3] = albedo_of(&s.p, &at), *size = malloc(n * sizeof(double)), *all = malloc(3 * n * sizeof(double)), sigma;
+    float *weight = malloc(n * sizeof(float)), *flat = malloc(n * sizeof(float));
+    assert_true(r && weight && flat && size && all);
+    s.p.weight = NULL;
+    residuals(&s.p, &at, albedo, r);
+    s.p.weight = choice.weight;
+    assert_int_equal(photometric_scale(&s.p, &at, &sigma), 0);
+    assert_int_equal(photometric_robust_weights(&s.p, &at, sigma, choice.weight, weight), 0);
+    assert_int_equal(photometric_robust_weights(&s.p, &at, sigma, NULL, flat), 0);
+    size_t m = 0, n_outliers = 0;
+    for (int t = 0; t < s.texels.n; t++)
+        for (int64_t i = s.samples.first[t]; i < s.samples.first[t + 1]; i++) {
+            size[i] = fmax(fmax(fabs(r[i][0]), fabs(r[i][1])), fabs(r[i][2]));
+            const bool seen = t % s.p.texel_step == 0 && choice.use_view[s.samples.view[i]];
+            const double u = size[i] / sigma, expected = seen ? 1 / ((1 + u * u) * (1 + u * u)) : 0;
+            close_to((double)flat[i], expected, 1e-4);
+            close_to((double)weight[i], expected * (double)choice.weight[i], 1e-4);
+            n_outliers += seen && flat[i] < .01f;
+            for (int c = 0; c < 3 && in_use(&s.p, t, i); c++)
+                all[m++] = fabs(r[i][c]);
+        }
+    assert_true(n_outliers > 10); // the nonsense with weight 0
+    qsort(all, m, sizeof(double), by_double);
+    close_to(sigma, 1.4826 * all[m / 2], 1e-3 * sigma);
+    free(r);
+    free(albedo);
+    free(size);
+    free(all);
+    free(weight);
+    free(flat);
+    free(choice.weight);
+    photometric_state_free(&at);
+    studio_close(&s);
+}
+
 int main(void)
 {
     const struct CMUnitTest tests[] = {
@@ -594,6 +917,14 @@ int main(void)
         cmocka_unit_test(free_albedo_finds_the_least_squares_one),
         cmocka_unit_test(measuring_leaves_the_albedo_alone),
         cmocka_unit_test(equations_are_those_of_the_residuals),
+        cmocka_unit_test(what_is_left_out_does_not_count),
+        cmocka_unit_test(clipped_samples_are_lower_bounds),
+        cmocka_unit_test(clipped_samples_do_not_pull_the_albedo),
+        cmocka_unit_test(equations_are_added_to_what_is_there),
+        cmocka_unit_test(tinted_gradients_point_downhill),
+        cmocka_unit_test(packing_comes_back),
+        cmocka_unit_test(threads_give_the_same_bytes),
+        cmocka_unit_test(robust_weights_are_geman_mcclures),
     };
     return cmocka_run_group_tests(tests, NULL, NULL);
 }
