@@ -34,8 +34,10 @@ void normal_rows_free(struct normal_rows *a)
 void normal_rows_flush(struct normal_rows *a)
 {
     const int n = a->n, width = a->n_padded;
-    if (!a->n_rows)
+    if (!a->n_rows || !n) { // BLAS refuses a row length of 0
+        a->n_rows = 0;
         return;
+    }
     cblas_ssyrk(CblasRowMajor, CblasLower, CblasTrans, n, a->n_rows, 1, a->rows, width, 0, a->product, width);
     for (int i = 0; i < n; i++) {
         const float *product = a->product + (size_t)i * (size_t)width;
