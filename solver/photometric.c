@@ -273,19 +273,28 @@ static float residual_of(const struct observation *o, int c, float albedo)
     return o->clipped && r > 0 ? 0 : r;
 }
 
+// Newton on the derivative by the albedo: own >= 0, so it rises, and clipped observations, which fall silent above their bound, bend it
+// downwards: from the second step on the albedo only grows, and with each step but the last an observation falls silent.
 static void solve_albedo(const struct observation *seen, int n_seen, float albedo[3])
 {
     for (int c = 0; c < 3; c++) {
-        double own2 = 0, rhs = 0;
-        for (int k = 0; k < n_seen; k++) {
-            const struct observation *o = &seen[k];
-            if (o->clipped && residual_of(o, c, albedo[c]) == 0)
-                continue;
-            own2 += (double)o->weight * (double)o->own[c] * (double)o->own[c];
-            rhs += (double)o->weight * (double)o->own[c] * ((double)o->o[c] - (double)o->constant[c]);
+        double a = (double)albedo[c];
+        for (int step = 0; step < n_seen + 2; step++) {
+            double own2 = 0, rhs = 0;
+            for (int k = 0; k < n_seen; k++) {
+                const struct observation *o = &seen[k];
+                const double own = (double)o->own[c], needed = (double)o->o[c] - (double)o->constant[c];
+                if (o->clipped && own * a >= needed)
+                    continue;
+                own2 += (double)o->weight * own * own;
+                rhs += (double)o->weight * own * needed;
+            }
+            const double next = own2 > 0 ? rhs / own2 : a, before = a;
+            a = next;
+            if (fabs(next - before) <= 1e-9)
+                break;
         }
-        if (own2 > 0)
-            albedo[c] = fminf(fmaxf((float)(rhs / own2), 0), most_albedo);
+        albedo[c] = fminf(fmaxf((float)a, 0), most_albedo);
     }
 }
 
