@@ -6,6 +6,14 @@
 #include <stdlib.h>
 #include <string.h>
 
+// OpenBLAS's sums depend on how many threads it takes, which is as many as there are cores: results must not. (Other BLAS lack the call.)
+void openblas_set_num_threads(int n) __attribute__((weak));
+static void __attribute__((constructor)) one_blas_thread(void)
+{
+    if (openblas_set_num_threads)
+        openblas_set_num_threads(1);
+}
+
 int normal_rows_new(struct normal_rows *a, int n)
 {
     memset(a, 0, sizeof(*a));
