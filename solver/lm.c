@@ -8,6 +8,14 @@
 #include <stdlib.h>
 #include <string.h>
 
+// OpenBLAS's sums depend on how many threads it takes, which is as many as there are cores: results must not. (Other BLAS lack the call.)
+void openblas_set_num_threads(int n) __attribute__((weak));
+static void __attribute__((constructor)) one_lapack_thread(void)
+{
+    if (openblas_set_num_threads)
+        openblas_set_num_threads(1);
+}
+
 struct lm_settings lm_defaults(void)
 {
     return (struct lm_settings){

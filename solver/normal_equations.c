@@ -6,13 +6,16 @@
 #include <stdlib.h>
 #include <string.h>
 
-// OpenBLAS would spin threads of its own beside ours; other BLAS libraries lack the function.
-extern void openblas_set_num_threads(int n) __attribute__((weak));
-
-int normal_rows_new(struct normal_rows *a, int n)
+// OpenBLAS's sums depend on how many threads it takes, which is as many as there are cores: results must not. (Other BLAS lack the call.)
+void openblas_set_num_threads(int n) __attribute__((weak));
+static void __attribute__((constructor)) one_blas_thread(void)
 {
     if (openblas_set_num_threads)
         openblas_set_num_threads(1);
+}
+
+int normal_rows_new(struct normal_rows *a, int n)
+{
     memset(a, 0, sizeof(*a));
     a->n = n;
     a->n_padded = (n + 15) / 16 * 16;
@@ -39,8 +42,10 @@ void normal_rows_free(struct normal_rows *a)
 void normal_rows_flush(struct normal_rows *a)
 {
     const int n = a->n, width = a->n_padded;
-    if (!a->n_rows)
+    if (!a->n_rows || !n) { // BLAS refuses a row length of 0
+        a->n_rows = 0;
         return;
+    }
     cblas_ssyrk(CblasRowMajor, CblasLower, CblasTrans, n, a->n_rows, 1, a->rows, width, 0, a->product, width);
     for (int i = 0; i < n; i++) {
         const float *product = a->product + (size_t)i * (size_t)width;

@@ -151,7 +151,7 @@ struct job {
     int n_free, *column;          // the compact place of each unknown, -1: not free
     int run;                      // lights per group when groups are aligned runs of so many and all are free; else 0
     bool tinted;                  // the tint matters: solve the albedo twice
-    float *residual;              // [samples n] for the scale and the robust weights, or NULL
+    float (*residual)[3];         // [samples n] for the scale and the robust weights, or NULL
 };
 
 static void job_free(struct job *j)
@@ -285,19 +285,28 @@ static float residual_of(const struct observation *o, int c, float albedo)
     return o->clipped && r > 0 ? 0 : r;
 }
 
+// Newton on the derivative by the albedo: own >= 0, so it rises, and clipped observations, which fall silent above their bound, bend it
+// downwards: from the second step on the albedo only grows, and with each step but the last an observation falls silent.
 static void solve_albedo(const struct observation *seen, int n_seen, float albedo[3])
 {
     for (int c = 0; c < 3; c++) {
-        double own2 = 0, rhs = 0;
-        for (int k = 0; k < n_seen; k++) {
-            const struct observation *o = &seen[k];
-            if (o->clipped && residual_of(o, c, albedo[c]) == 0)
-                continue;
-            own2 += (double)o->weight * (double)o->own[c] * (double)o->own[c];
-            rhs += (double)o->weight * (double)o->own[c] * ((double)o->o[c] - (double)o->constant[c]);
+        double a = (double)albedo[c];
+        for (int step = 0; step < n_seen + 2; step++) {
+            double own2 = 0, rhs = 0;
+            for (int k = 0; k < n_seen; k++) {
+                const struct observation *o = &seen[k];
+                const double own = (double)o->own[c], needed = (double)o->o[c] - (double)o->constant[c];
+                if (o->clipped && own * a >= needed)
+                    continue;
+                own2 += (double)o->weight * own * own;
+                rhs += (double)o->weight * own * needed;
+            }
+            const double next = own2 > 0 ? rhs / own2 : a, before = a;
+            a = next;
+            if (fabs(next - before) <= 1e-9)
+                break;
         }
-        if (own2 > 0)
-            albedo[c] = fminf(fmaxf((float)(rhs / own2), 0), most_albedo);
+        albedo[c] = fminf(fmaxf((float)a, 0), most_albedo);
     }
 }
 
@@ -335,20 +344,17 @@ static void evaluate_texels(void *arg, int64_t begin, int64_t end, int worker, d
         int64_t i = j->p->samples->first[texel];
         for (int k = 0; k < n_seen; k++) {
             const struct observation *o = &w->seen[k];
-            float largest = 0;
+            while (j->p->samples->view[i] != o->view)
+                i++;
             for (int c = 0; c < 3; c++) {
                 const float L = o->constant[c] + o->own[c] * m.albedo[c], r = residual_of(o, c, m.albedo[c]);
                 const float shown = clip01(L) - clip01(o->o[c]);
                 partial[0] += .5 * (double)o->weight * (double)r * (double)r;
                 partial[1] += (double)shown * (double)shown;
-                largest = fmaxf(largest, fabsf(r));
+                if (j->residual)
+                    j->residual[i][c] = fabsf(r);
             }
             partial[2] += 1;
-            if (j->residual) {
-                while (j->p->samples->view[i] != o->view)
-                    i++;
-                j->residual[i] = largest;
-            }
         }
     }
 }
@@ -358,7 +364,7 @@ static int64_t chunk_of(const struct photometric *p)
     return (p->texels->n + N_CHUNKS - 1) / N_CHUNKS;
 }
 
-static int evaluate(const struct photometric *p, struct photometric_state *s, bool fit, float *residual,
+static int evaluate(const struct photometric *p, struct photometric_state *s, bool fit, float (*residual)[3],
                     struct photometric_error *error)
 {
     struct job j;
@@ -554,17 +560,16 @@ static int by_float(const void *a, const void *b)
     return (x > y) - (x < y);
 }
 
-static int residuals(const struct photometric *p, const struct photometric_state *s, float **out)
+// |L - o| of every sample in use; -1 where it is not.
+static int residuals(const struct photometric *p, const struct photometric_state *s, float (**out)[3])
 {
     struct photometric_error error;
-    struct photometric plain = *p;
-    plain.weight = NULL;
-    float *r = malloc((size_t)p->samples->n * sizeof(float) + 1);
+    float(*r)[3] = malloc((size_t)p->samples->n * sizeof(*r) + 1);
     if (!r)
         return -ENOMEM;
     for (int64_t i = 0; i < p->samples->n; i++)
-        r[i] = -1;
-    const int err = evaluate(&plain, (struct photometric_state *)s, false, r, &error);
+        r[i][0] = r[i][1] = r[i][2] = -1;
+    const int err = evaluate(p, (struct photometric_state *)s, false, r, &error);
     if (err)
         free(r);
     else
@@ -574,16 +579,17 @@ static int residuals(const struct photometric *p, const struct photometric_state
 
 int photometric_scale(const struct photometric *p, const struct photometric_state *s, double *sigma)
 {
-    float *r;
+    float(*r)[3];
     const int err = residuals(p, s, &r);
     if (err)
         return err;
+    float *all = r[0];
     int64_t n = 0;
-    for (int64_t i = 0; i < p->samples->n; i++)
-        if (r[i] >= 0)
-            r[n++] = r[i];
-    qsort(r, (size_t)n, sizeof(float), by_float);
-    *sigma = n ? 1.4826 * (double)r[n / 2] : 0;
+    for (int64_t i = 0; i < 3 * p->samples->n; i++)
+        if (all[i] >= 0)
+            all[n++] = all[i];
+    qsort(all, (size_t)n, sizeof(float), by_float);
+    *sigma = n ? 1.4826 * (double)all[n / 2] : 0;
     free(r);
     return 0;
 }
@@ -591,13 +597,16 @@ int photometric_scale(const struct photometric *p, const struct photometric_stat
 int photometric_robust_weights(const struct photometric *p, const struct photometric_state *s, double sigma,
                                const float *base, float *weight)
 {
-    float *r;
-    const int err = residuals(p, s, &r);
+    float(*r)[3];
+    struct photometric plain = *p;
+    plain.weight = NULL;
+    const int err = residuals(&plain, s, &r);
     if (err)
         return err;
     for (int64_t i = 0; i < p->samples->n; i++) {
-        const double u = (double)r[i] / (sigma > 0 ? sigma : 1), w = 1 / (1 + u * u);
-        weight[i] = r[i] < 0 ? 0 : (float)(w * w) * (base ? base[i] : 1);
+        const float largest = fmaxf(fmaxf(r[i][0], r[i][1]), r[i][2]);
+        const double u = (double)largest / (sigma > 0 ? sigma : 1), w = 1 / (1 + u * u);
+        weight[i] = largest < 0 ? 0 : (float)(w * w) * (base ? base[i] : 1);
     }
     free(r);
     return 0;

@@ -45,9 +45,25 @@ struct footprint {
     double texels_from_pixel[4]; // 2 x 2: along tangent and bitangent
 };
 
+// hypot, fmin and fmax are calls, and guard against what does not occur here.
+static double length_of(double x, double y)
+{
+    return sqrt(x * x + y * y);
+}
+
+static double lesser(double x, double y)
+{
+    return x < y ? x : y;
+}
+
+static double greater(double x, double y)
+{
+    return x > y ? x : y;
+}
+
 static double half_side(double spread_px)
 {
-    return .5 * fmin(fmax(spread_px, 1), MAX_FOOTPRINT_PX);
+    return .5 * lesser(greater(spread_px, 1), MAX_FOOTPRINT_PX);
 }
 
 // A texel is a square of texel_size_m on the surface, a parallelogram in the picture; the box has
@@ -69,8 +85,8 @@ static bool footprint_of(struct footprint *f, const struct texels *t, int64_t i,
         M[2 * k + 1] = vec3_dot(J + 3 * k, bitangent) * (double)t->texel_size_m;
     }
     f->u_px = uv_px[0], f->v_px = uv_px[1];
-    f->half_width_px = half_side(hypot(M[0], M[1]));
-    f->half_height_px = half_side(hypot(M[2], M[3]));
+    f->half_width_px = half_side(length_of(M[0], M[1]));
+    f->half_height_px = half_side(length_of(M[2], M[3]));
     const double x_reach = f->half_width_px + GRADIENT_STEP_PX,
                  y_reach = f->half_height_px + GRADIENT_STEP_PX;
     if (!(f->u_px >= x_reach && f->u_px <= camera->width_px - x_reach && f->v_px >= y_reach &&
@@ -171,10 +187,13 @@ static bool sees_only_its_surface(const struct view_job *job, int64_t i, const s
             double off_m = 0;
             for (int c = 0; c < 3; c++)
                 off_m += (double)t->normal[i][c] * ((double)seen[c] - (double)t->position_m[i][c]);
+            off_m = fabs(off_m);
+            if (off_m <= LEAVE_TEXELS * texel_m)
+                continue;
             const double dx = x + .5 - f->u_px, dy = y + .5 - f->v_px;
-            const double along =
-                hypot(to_texels[0] * dx + to_texels[1] * dy, to_texels[2] * dx + to_texels[3] * dy);
-            if (!(fabs(off_m) <= (LEAVE_TEXELS + BEND * along) * texel_m)) // NaN too
+            const double along = length_of(to_texels[0] * dx + to_texels[1] * dy,
+                                           to_texels[2] * dx + to_texels[3] * dy);
+            if (!(off_m <= (LEAVE_TEXELS + BEND * along) * texel_m)) // NaN too
                 return false;
         }
     return true;
@@ -182,8 +201,7 @@ static bool sees_only_its_surface(const struct view_job *job, int64_t i, const s
 
 static const float *pixel_at(const struct image *image, int x, int y)
 {
-    return image->data +
-           ((size_t)y * (size_t)image->width + (size_t)x) * (size_t)image->n_channels;
+    return image->data + ((size_t)y * (size_t)image->width + (size_t)x) * (size_t)image->n_channels;
 }
 
 // The mean over the footprint moved by (dx, dy): every pixel by the area it shares with the box.
@@ -192,14 +210,15 @@ static void mean_over(double rgb[3], const struct view_job *job, const struct fo
 {
     const struct image *image = job->image;
     const double u_px = f->u_px + dx_px, v_px = f->v_px + dy_px; // inside but for rounding
-    const double x0 = fmax(u_px - f->half_width_px, 0), y0 = fmax(v_px - f->half_height_px, 0);
-    const double x1 = fmin(u_px + f->half_width_px, image->width),
-                 y1 = fmin(v_px + f->half_height_px, image->height);
+    const double x0 = greater(u_px - f->half_width_px, 0),
+                 y0 = greater(v_px - f->half_height_px, 0);
+    const double x1 = lesser(u_px + f->half_width_px, image->width),
+                 y1 = lesser(v_px + f->half_height_px, image->height);
     rgb[0] = rgb[1] = rgb[2] = 0;
     for (int y = (int)y0; y < y1; y++) {
-        const double rows = fmin(y + 1, y1) - fmax(y, y0);
+        const double rows = lesser(y + 1, y1) - greater(y, y0);
         for (int x = (int)x0; x < x1; x++) {
-            const double area = rows * (fmin(x + 1, x1) - fmax(x, x0));
+            const double area = rows * (lesser(x + 1, x1) - greater(x, x0));
             const float *pixel = pixel_at(image, x, y);
             for (int c = 0; c < 3; c++)
                 rgb[c] += area * (double)pixel[job->rgb[c]];
@@ -250,7 +269,7 @@ static void read_texels(void *arg, int64_t begin, int64_t end, int worker)
         mean_over(rgb, job, &f, 0, 0);
         for (int c = 0; c < 3; c++)
             job->value[i][c] = half_from_float((float)rgb[c]);
-        job->value[i][3] = half_from_float((float)(hypot(across, down) / (2 * step)));
+        job->value[i][3] = half_from_float((float)(length_of(across, down) / (2 * step)));
         job->flags[i] = is_clipped(job, &f) ? SAMPLE_CLIPPED : 0;
     }
 }

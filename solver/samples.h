@@ -1,7 +1,8 @@
 // solver/samples.h - what the cameras measured of every texel.
 //
 // One sample: texel t seen by view k, linear radiance at the projected texel centre. Samples are stored texel by texel, views
-// ascending; radiance as half floats. A view is decoded once, at most two are in memory at a time.
+// ascending; radiance as half floats. A view is decoded once, and only one is in memory at a time. 11 bytes a sample;
+// while gathering 20, and a bit per texel and view.
 #pragma once
 #include "solver/cameras.h"
 #include "solver/rays.h"
@@ -18,7 +19,8 @@ struct samples {
     int64_t *first;          // [n_texels + 1]: texel t has samples first[t] .. first[t+1]-1
     uint16_t *view;          // [n]
     uint16_t (*radiance)[3]; // [n] half floats, R G B; samples_radiance() widens
-    uint16_t *gradient;      // [n] half float: |d luminance / d pixel| at the sample, per pixel (for registration error)
+    uint16_t *gradient;      // [n] half float: |d luminance / d pixel| at the sample, per pixel (for registration error): by the
+                             // differences of what would be read half a pixel to either side
     uint8_t *flags;          // [n]
     double (*centre_m)[3];   // [n_views] camera centres
     char (*name)[CAMERA_NAME_MAX]; // [n_views]
@@ -27,17 +29,21 @@ struct samples {
 
 struct samples_settings {
     double grazing_cos; // samples below are left out; .15 (SOLVER.md 2)
-    int erode_px;       // samples this near (in pixels) to a silhouette or depth edge are left out; 1
+    int erode_px;       // samples this near (in pixels) to a silhouette or depth edge are left out; 1. Counted from the pixels a
+                        // sample reads: 1 makes sure that no pixel that is read lies on the edge itself; 0 looks at their centres only
     double white;       // clip level where an image has no "clip" channel; 1.0; 0: never
     int n_threads;
 };
 struct samples_settings samples_defaults(void);
 
 // Project every texel into every view (image_paths[k] belongs to cameras->view[k]; NULL: the view is skipped), test visibility with
-// rays, and read the radiance: bilinear at the texel centre where the texel's footprint is at most a pixel, else the mean over
-// the footprint (a box of the projected texel's size, at most 8 x 8 px). Images of another size than the camera says are
-// accepted when the aspect matches (the camera is resized), else refused. Pixels that are not finite refuse the view by name.
-// 0, -errno of reading (logged with the view), -EINVAL, -ENOMEM. Same bytes for any thread count.
+// rays, and read the radiance: the mean over a box as wide and high as the projected texel is spread along x and y, each side
+// 1 to 8 px (1: bilinear interpolation). Left out: what visibility_camera_mask() does not call visible; boxes within half a
+// pixel of the picture's border; and those that read, or have within erode_px around what they read, a pixel whose ray (through its centre)
+// misses the mesh or meets it further off the texel's tangent plane than 4 texels plus a quarter of the distance along it.
+// Images of another size than the camera says are accepted when the aspect matches (the camera is resized), else refused; so
+// are views without R, G or B, and those with a pixel (R, G, B, clip) that is not finite: by name. At most 65,536 views.
+// 0, -errno of reading, -EINVAL, -EDOM (not finite), -ENOMEM. Same bytes for any thread count.
 int samples_gather(struct samples *out, const struct texels *t, const struct rays *r, const struct cameras *cameras,
                    const char *const *image_paths, const struct samples_settings *settings);
 void samples_free(struct samples *s); // leaves it zeroed

@@ -201,7 +201,7 @@ static void largest_derivatives(const struct camera *camera, double *second, dou
 static void a_smooth_surface_is_read_to_the_accuracy_of_bilinear_interpolation(void **state)
 {
     (void)state;
-    double rms_before = 0;
+    double rms_before = 0, slope_before = 0;
     for (int scale = 1; scale <= 4; scale *= 2) {
         struct scene s;
         scene_open(&s, floor_mesh(), 320);
@@ -215,7 +215,7 @@ static void a_smooth_surface_is_read_to_the_accuracy_of_bilinear_interpolation(v
         struct samples got;
         assert_int_equal(gather(&got, &s), 0);
         assert_true(got.n > 20000);
-        double sum = 0;
+        double sum = 0, slope_sum[2] = {0};
         for (int t = 0; t < got.n_texels; t++)
             for (int64_t i = got.first[t]; i < got.first[t + 1]; i++) {
                 double point[3], normal[3], uv_px[2];
@@ -233,13 +233,19 @@ static void a_smooth_surface_is_read_to_the_accuracy_of_bilinear_interpolation(v
                                                floor_seen_at(&s.view[v], uv_px[0], uv_px[1] - .1)) /
                                      .2;
                 const double luminance = .2126 + .7152 * .5 - .0722;
-                assert_true(fabs((double)samples_gradient(&got, i) - luminance * slope) <
-                            luminance * second); // differences over 2 px at most
+                const double wrong = (double)samples_gradient(&got, i) - luminance * slope;
+                slope_sum[0] += wrong * wrong;
+                slope_sum[1] += luminance * luminance * slope * slope;
                 sum += error * error;
             }
         const double rms = sqrt(sum / (double)got.n);
         fprintf(stderr, "# %3d px wide: rms error %.2e, bound %.2e, largest slope %.3f\n",
                 60 * scale, rms, second / 8, first);
+        const double slope_error = sqrt(slope_sum[0] / slope_sum[1]);
+        fprintf(stderr, "# gradient: %.2f %% off\n", 100 * slope_error);
+        if (scale > 1)
+            assert_true(slope_before / slope_error > 3);
+        slope_before = slope_error;
         if (scale > 1)
             assert_true(rms_before / rms > 3.6 && rms_before / rms < 4.4);
         rms_before = rms;
