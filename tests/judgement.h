@@ -10,7 +10,9 @@
 // A light stands for the pixels of its region: its true distance is 1 / mean(1/r) over their true
 // rays, weighted by luminance x solid angle; of a light without a region, that of the ray R* dh.
 // Light that comes from no rectangle, or from behind one, has no true distance: a light with less
-// than half of its energy from rectangles is counted as off the panels and left out.
+// than half of its energy from rectangles is counted as off the panels and left out. Where
+// the report has n_sub_lights, each aligned run of so many is one light of all their regions: what
+// a solver splits is judged as what it did not split.
 #pragma once
 #include "solver/disney.h"
 #include "solver/lights.h"
@@ -34,7 +36,7 @@
 // emitter is not.
 struct judgement {
     char method[32];
-    int trusted; // -1: not said
+    int trusted;                                                         // -1: not said
     double rmse_fit_percent, rmse_held_out_percent, wall_s, n_jacobians; // as the report says
     // Over the lights with energy that come from a panel; "weighted": by their luminance.
     int n_lights, n_off_panels, n_directional;
@@ -46,8 +48,8 @@ struct judgement {
     double theta_true[DISNEY_N];                 // means over the covered texels
     double theta_error[DISNEY_N];                // |theta - theta_true|
     bool theta_uniform;                          // all texels of the truth are equal
-    // sqrt(sum |a - a*|^2 / sum |a*|^2) over the texels that the solve calls valid; "scaled": of k a,
-    // with the one k that fits best.
+    // sqrt(sum |a - a*|^2 / sum |a*|^2) over the texels that the solve calls valid; "scaled": of k
+    // a, with the one k that fits best.
     int n_texels, n_covered_texels;
     double albedo_percent, albedo_scaled_percent, albedo_scale;
 };
@@ -141,7 +143,8 @@ static inline int judge_read_truth(struct judge_truth *t, const char *take)
     return err;
 }
 
-// 1 / distance from the true centre to what the ray meets first; 0: nothing, or a panel's dark side.
+// 1 / distance from the true centre to what the ray meets first; 0: nothing, or a panel's dark
+// side.
 static inline double judge_true_inverse_distance(const struct judge_truth *t,
                                                  const double dir_probe[3])
 {
@@ -175,14 +178,31 @@ static inline double judge_luminance(double r, double g, double b)
     return .2126 * r + .7152 * g + .0722 * b;
 }
 
-// 1/r* of one light, 0: off the panels.
-static inline double judge_light_inverse_distance(const struct judge_truth *t,
-                                                  const struct panorama *p, const struct lights *l,
-                                                  int i)
+struct judge_seen { // energy that reaches the true centre, that part of it from panels, and 1/r* x
+                    // that
+    double all, met, sum;
+};
+
+static inline void judge_add_ray(struct judge_seen *seen, const struct judge_truth *t,
+                                 const double dir_probe[3], double energy)
+{
+    const double q = judge_true_inverse_distance(t, dir_probe);
+    seen->all += energy;
+    seen->met += q > 0 ? energy : 0;
+    seen->sum += q * energy;
+}
+
+static inline double judge_light_luminance(const struct lights *l, int i)
+{
+    return judge_luminance(l->irradiance[i][0], l->irradiance[i][1], l->irradiance[i][2]);
+}
+
+static inline void judge_add_light(struct judge_seen *seen, const struct judge_truth *t,
+                                   const struct panorama *p, const struct lights *l, int i)
 {
     const int width = p->image.width, height = p->image.height;
     struct light_region r = l->region ? l->region[i] : (struct light_region){0};
-    double all = 0, met = 0, sum = 0;
+    const double before = seen->all;
     if (l->region) { // it may have been cut from a copy of another size
         r.x0 = (int)((int64_t)r.x0 * width / l->panorama_width_px);
         r.x1 = (int)((int64_t)r.x1 * width / l->panorama_width_px);
@@ -198,15 +218,11 @@ static inline double judge_light_inverse_distance(const struct judge_truth *t,
             if (energy <= 0)
                 continue;
             panorama_direction(width, height, x + .5, y + .5, dir);
-            const double q = judge_true_inverse_distance(t, dir);
-            all += energy;
-            met += q > 0 ? energy : 0;
-            sum += q * energy;
+            judge_add_ray(seen, t, dir, energy);
         }
     }
-    if (all <= 0)
-        return judge_true_inverse_distance(t, l->dir_probe[i]);
-    return met >= .5 * all ? sum / met : 0;
+    if (seen->all <= before)
+        judge_add_ray(seen, t, l->dir_probe[i], judge_light_luminance(l, i));
 }
 
 // ---- lights -------------------------------------------------------------------------------------
@@ -236,32 +252,43 @@ static inline double judge_median(const struct judge_weighted *v, int n, bool pl
 }
 
 static inline int judge_lights(struct judgement *out, const struct judge_truth *t,
-                               const struct panorama *p, const struct lights *l)
+                               const struct panorama *p, const struct lights *l, int n_sub)
 {
     struct judge_weighted *error = calloc((size_t)l->n, sizeof(*error));
     double sum = 0, sum_weighted = 0, away = 0, away_weighted = 0, weights = 0;
     int n = 0;
     if (!error)
         return -ENOMEM;
-    for (int i = 0; i < l->n; i++) {
-        const double *c = l->irradiance[i], weight = judge_luminance(c[0], c[1], c[2]);
+    for (int i = 0; i < l->n; i += n_sub) {
+        struct judge_seen seen = {0};
         const double q = l->inverse_distance[i];
-        double here[3], there[3], off[3];
+        double weight = 0, dir[3] = {0}, here[3], there[3], off[3];
+        for (int k = i; k < i + n_sub; k++) {
+            const double luminance = judge_light_luminance(l, k);
+            if (luminance <= 0)
+                continue;
+            weight += luminance;
+            vec3_add_scaled(dir, dir, luminance, l->dir_probe[k]);
+            judge_add_light(&seen, t, p, l, k);
+        }
         if (weight <= 0)
             continue;
-        const double q_true = judge_light_inverse_distance(t, p, l, i);
-        if (q_true <= 0) {
+        if (seen.met < .5 * seen.all) {
             out->n_off_panels++;
             continue;
         }
-        out->n_directional += q <= 0;
-        const double relative = fabs(1 / q - 1 / q_true) * q_true;
-        mat3_mul_vec(here, l->world_from_probe, l->dir_probe[i]);
-        mat3_mul_vec(there, t->world_from_probe, l->dir_probe[i]);
+        const double q_true = seen.sum / seen.met, relative = fabs(1 / q - 1 / q_true) * q_true;
+        if (n_sub > 1)
+            vec3_normalise(dir);
+        else
+            memcpy(dir, l->dir_probe[i], sizeof(dir));
+        mat3_mul_vec(here, l->world_from_probe, dir);
+        mat3_mul_vec(there, t->world_from_probe, dir);
         vec3_add_scaled(here, l->centre_m, 1 / q, here);
         vec3_add_scaled(there, t->centre_m, 1 / q_true, there);
         vec3_sub(off, here, there);
         const double off_m = q > 0 ? vec3_norm(off) : INFINITY;
+        out->n_directional += q <= 0;
         sum += relative, sum_weighted += weight * relative;
         away += off_m, away_weighted += weight * off_m, weights += weight;
         error[n++] = (struct judge_weighted){relative, weight};
@@ -326,8 +353,15 @@ static inline int judge_set_up(struct judgement *out, const struct judge_truth *
         out->centre_cm = 100 * vec3_norm(off);
         judge_check_report(report, &l, solve);
     }
-    if (!t->directional)
-        err = judge_lights(out, t, p, &l);
+    int64_t n_sub = 1;
+    json_get_int(report, "n_sub_lights", &n_sub);
+    if (n_sub < 1 || n_sub > l.n || l.n % n_sub) {
+        log_error("judge: %s: report.json: n_sub_lights is %lld, of %d lights", solve,
+                  (long long)n_sub, l.n);
+        err = -EINVAL;
+    }
+    if (!err && !t->directional)
+        err = judge_lights(out, t, p, &l, (int)n_sub);
     lights_free(&l);
     return err;
 }
@@ -361,8 +395,8 @@ static inline int judge_theta_means(double theta[DISNEY_N], bool *uniform,
         const int channel = names[k] ? image_channel(&image, names[k]) : -1;
         double sum = 0, low = INFINITY, high = -INFINITY;
         for (int i = 0; channel >= 0 && i < texels.n; i++) {
-            const double v = image.data[(size_t)texels.pixel[i] * (size_t)image.n_channels +
-                                        (size_t)channel];
+            const double v =
+                image.data[(size_t)texels.pixel[i] * (size_t)image.n_channels + (size_t)channel];
             sum += v, low = fmin(low, v), high = fmax(high, v);
         }
         if (channel < 0)

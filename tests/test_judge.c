@@ -1,5 +1,5 @@
-// tests/test_judge.c - the judge of solves says by how much a solve is wrong: hand-made solves, wrong
-// by known amounts.
+// tests/test_judge.c - the judge of solves says by how much a solve is wrong: hand-made solves,
+// wrong by known amounts.
 #include "solver/synth.h"
 #include "tests/judgement.h"
 
@@ -71,9 +71,8 @@ static struct judgement judge_known(struct known *k)
     mkdir(solve, 0777);
     assert_int_equal(lights_write_json(&k->lights, path_in(solve, "lights.json")), 0);
     assert_int_equal(json_write(k->report, path_in(solve, "report.json")), 0);
-    assert_int_equal(image_write_exr(&k->albedo, path_in(solve, "albedo.exr"), IMAGE_FLOAT,
-                                     IMAGE_ZIP),
-                     0);
+    assert_int_equal(
+        image_write_exr(&k->albedo, path_in(solve, "albedo.exr"), IMAGE_FLOAT, IMAGE_ZIP), 0);
     assert_int_equal(judge_solve(&j, solve, take), 0);
     lights_free(&k->lights), image_free(&k->albedo), json_free(k->report);
     nftw(solve, remove_one, 16, FTW_DEPTH | FTW_PHYS);
@@ -100,9 +99,9 @@ static void first_panel_that_the_ray_meets_counts(void **state)
     const struct {
         double through[3], z; // the height at which it ends; 0: nothing shines there
     } ray[] = {
-        {{0, 0, 2}, 2},      {{.49, .99, 2}, 2},   {{-.51, -1.01, 2}, 3}, {{0, -1.01, 2}, 3},
-        {{.51, .5, 2}, 0},   {{2.99, -2.99, 3}, 3}, {{3.01, -1, 3}, 0},   {{0, 0, -2}, 0},
-        {{1, 0, 0}, 0},
+        {{0, 0, 2}, 2},     {{.49, .99, 2}, 2}, {{-.51, -1.01, 2}, 3},
+        {{0, -1.01, 2}, 3}, {{.51, .5, 2}, 0},  {{2.99, -2.99, 3}, 3},
+        {{3.01, -1, 3}, 0}, {{0, 0, -2}, 0},    {{1, 0, 0}, 0},
     };
     for (size_t i = 0; i < sizeof(ray) / sizeof(ray[0]); i++) {
         double dir[3] = {ray[i].through[0], ray[i].through[1], ray[i].through[2]};
@@ -163,7 +162,7 @@ static void one_light_twice_as_far_weighs_its_share(void **state)
     open_known(&k);
     const int n = k.lights.n;
     for (int i = 0; i < n; i++) {
-        const double *c = k.lights.irradiance[i], weight = judge_luminance(c[0], c[1], c[2]);
+        const double weight = judge_light_luminance(&k.lights, i);
         sum += weight;
         if (weight > most)
             most = weight, brightest = i;
@@ -255,7 +254,7 @@ static void region_is_as_far_as_its_true_lights(void **state)
     assert_int_equal(panorama_read(&p, path_in(take, "panorama.exr")), 0);
     assert_int_equal(lights_median_cut(&cut, &p, N), 0);
     for (int i = 0; i < k.lights.n; i++) {
-        const double *c = k.lights.irradiance[i], weight = judge_luminance(c[0], c[1], c[2]);
+        const double weight = judge_light_luminance(&k.lights, i);
         double x_px, y_px;
         panorama_pixel(512, 256, k.lights.dir_probe[i], &x_px, &y_px);
         for (int m = 0; m < N; m++)
@@ -290,6 +289,39 @@ static void region_is_as_far_as_its_true_lights(void **state)
     panorama_free(&p);
 }
 
+// Four sub-lights of one distance against the light that they were cut from.
+static void sub_lights_are_judged_as_one(void **state)
+{
+    (void)state;
+    struct known k;
+    struct panorama p;
+    struct lights cut;
+    struct judgement j[2];
+    enum { N = 32 };
+    assert_int_equal(panorama_read(&p, path_in(take, "panorama.exr")), 0);
+    for (int split = 0; split < 2; split++) {
+        const int n_sub = split ? 4 : 1;
+        open_known(&k);
+        assert_int_equal(lights_median_cut(&cut, &p, N * n_sub), 0);
+        memcpy(cut.centre_m, k.centre_m, sizeof(cut.centre_m));
+        memcpy(cut.world_from_probe, k.world_from_probe, sizeof(cut.world_from_probe));
+        for (int i = 0; i < cut.n; i++)
+            cut.inverse_distance[i] = 1 / (1 + .02 * (i / n_sub));
+        json_set_int(k.report, "n_sub_lights", n_sub);
+        lights_free(&k.lights);
+        k.lights = cut;
+        j[split] = judge_known(&k);
+    }
+    assert_int_equal(j[0].n_lights, N);
+    assert_int_equal(j[1].n_lights, N);
+    near(j[1].distance_percent, j[0].distance_percent, 1e-9);
+    near(j[1].distance_median_percent, j[0].distance_median_percent, 1e-9);
+    near(j[1].distance_weighted_percent, j[0].distance_weighted_percent, 1e-6);
+    assert_true(j[0].distance_percent > 1);
+    near(j[1].position_cm, j[0].position_cm, .01 * j[0].position_cm); // mean of unit vectors
+    panorama_free(&p);
+}
+
 static void theta_is_judged_in_its_own_deviations(void **state)
 {
     (void)state;
@@ -306,7 +338,7 @@ static void theta_is_judged_in_its_own_deviations(void **state)
     const struct judgement j = judge_known(&k);
     for (int i = 0; i < DISNEY_N; i++)
         near(j.theta_error[i],
-             i == DISNEY_METALLIC         ? .05
+             i == DISNEY_METALLIC          ? .05
              : i == DISNEY_CLEARCOAT_GLOSS ? .75
                                            : 0,
              1e-7); // the truth is in floats
@@ -427,6 +459,7 @@ int main(void)
         cmocka_unit_test(two_degrees_turned),
         cmocka_unit_test(directional_lights_are_infinitely_wrong),
         cmocka_unit_test(region_is_as_far_as_its_true_lights),
+        cmocka_unit_test(sub_lights_are_judged_as_one),
         cmocka_unit_test(theta_is_judged_in_its_own_deviations),
         cmocka_unit_test(albedo_too_bright_by_a_tenth),
         cmocka_unit_test(albedo_counts_only_where_the_solve_calls_it_valid),
