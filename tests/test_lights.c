@@ -897,6 +897,95 @@ static void what_a_hand_may_write_is_read(void **state)
     lights_free(&l);
 }
 
+// ---- the pose of the probe ----------------------------------------------------------------------
+
+#define CENTRE ", \"centre_m\": [1, 2, 3]"
+
+static int read_pose(struct lights *l, bool *has_centre, const char *rows, const char *rest)
+{
+    const char *path = in_folder("pose.json");
+    FILE *f = fopen(path, "w");
+    assert_non_null(f);
+    fprintf(f, "{\"note\": \"by hand\", \"world_from_probe\": %s%s}\n", rows, rest);
+    assert_int_equal(fclose(f), 0);
+    log_set_hook(remember, NULL);
+    *last_error = '\0';
+    const int err = lights_read_pose(l, has_centre, path);
+    log_set_hook(NULL, NULL);
+    unlink(path);
+    return err;
+}
+
+static void a_pose_is_the_nearest_rotation_and_an_exact_one_keeps_its_bits(void **state)
+{
+    (void)state;
+    const double w[3] = {.4, -1.1, .7};
+    double exact[9];
+    char rows[512];
+    bool has_centre = false;
+    struct lights l;
+    assert_int_equal(lights_new(&l, 1), 0);
+    mat3_from_rotation_vector(exact, w);
+    for (int decimals = 5; decimals <= 17; decimals += 12) {
+        int n = 0;
+        for (int i = 0; i < 9; i++)
+            n += snprintf(rows + n, sizeof(rows) - (size_t)n, "%s%.*f", i ? "," : "[", decimals,
+                          exact[i]);
+        snprintf(rows + n, sizeof(rows) - (size_t)n, "]");
+        assert_int_equal(read_pose(&l, &has_centre, rows, CENTRE), 0);
+        assert_true(has_centre && l.centre_m[0] == 1 && l.centre_m[2] == 3);
+        for (int i = 0; i < 9; i++) {
+            const double *R = l.world_from_probe;
+            assert_near(R[i], exact[i], decimals == 5 ? 2e-5 : 0);
+            assert_near(vec3_dot(R + 3 * (i / 3), R + 3 * (i % 3)), i % 4 == 0, 1e-15);
+        }
+    }
+    lights_free(&l);
+}
+
+static void a_pose_without_a_centre_leaves_it_where_it_may(void **state)
+{
+    (void)state;
+    struct lights l;
+    bool has_centre = true;
+    assert_int_equal(lights_new(&l, 1), 0);
+    l.centre_m[1] = 7;
+    assert_int_equal(read_pose(&l, &has_centre, "[[0,0,1],[1,0,0],[0,1,0]]", ""), 0);
+    assert_true(!has_centre && l.centre_m[1] == 7 && l.world_from_probe[2] == 1);
+    assert_int_equal(read_pose(&l, NULL, "[[1,0,0],[0,1,0],[0,0,1]]", ""), -EINVAL);
+    assert_non_null(strstr(last_error, "centre_m"));
+    assert_true(l.world_from_probe[2] == 1); // as it was
+    lights_free(&l);
+}
+
+static void a_pose_that_is_no_rotation_is_refused_and_changes_nothing(void **state)
+{
+    (void)state;
+    static const struct {
+        const char *rows, *rest, *says;
+    } cases[] = {
+        {"[[1,0,0],[0,1,0],[0,0,-1]]", CENTRE, "determinant -1"},
+        {"[[1,0,0],[0,1,0],[0,0,1.001]]", CENTRE, "not a rotation"},
+        {"[[1,0,0],[0,1,0],[0,0.001,1]]", CENTRE, "not a rotation"},
+        {"[[0,0,0],[0,0,0],[0,0,0]]", CENTRE, "not a rotation"},
+        {"[[1e300,0,0],[0,1e300,0],[0,0,1e300]]", CENTRE, "not a rotation"},
+        {"[[1,0,0],[0,1,0]]", CENTRE, "world_from_probe"},
+        {"[[1,0,0],[0,1,0],[0,0,1]]", ", \"centre_m\": [0, 0]", "centre_m"},
+        {"[[1,0,0],[0,1,0],[0,0,1]]", ", \"centre_m\": [0, 2e9, 0]", "1e9"},
+    };
+    for (int i = 0; i < (int)(sizeof(cases) / sizeof(cases[0])); i++) {
+        struct lights l;
+        bool has_centre;
+        assert_int_equal(lights_new(&l, 1), 0);
+        l.centre_m[2] = 5;
+        assert_int_equal(read_pose(&l, &has_centre, cases[i].rows, cases[i].rest), -EINVAL);
+        if (!strstr(last_error, cases[i].says) || !strstr(last_error, "pose.json"))
+            fail_msg("case %d: '%s' does not name '%s'", i, last_error, cases[i].says);
+        assert_true(l.centre_m[2] == 5 && l.world_from_probe[4] == 1 && l.centre_m[1] == 0);
+        lights_free(&l);
+    }
+}
+
 // ---- the path-traced studios --------------------------------------------------------------------
 
 static const char *const studios[] = {"../shared/data/studio-pebble", "../shared/data/studio-vase"};
@@ -1254,6 +1343,9 @@ int main(void)
         cmocka_unit_test(wrong_lights_are_refused_by_name),
         cmocka_unit_test(more_lights_than_the_limit_are_refused),
         cmocka_unit_test(what_a_hand_may_write_is_read),
+        cmocka_unit_test(a_pose_is_the_nearest_rotation_and_an_exact_one_keeps_its_bits),
+        cmocka_unit_test(a_pose_without_a_centre_leaves_it_where_it_may),
+        cmocka_unit_test(a_pose_that_is_no_rotation_is_refused_and_changes_nothing),
         cmocka_unit_test(panels_of_the_studios_are_found_by_the_cut),
         cmocka_unit_test(the_white_patch_is_predicted_from_the_panorama_at_its_place),
     };
