@@ -1,15 +1,14 @@
 // solver/commands/solve.c - rigsolve solve: from a take to the lights' places and a shared reflectance with per-texel albedo.
-#include "solver/cameras.h"
+#include "solver/commands/arguments.h"
 #include "solver/commands/commands.h"
+#include "solver/commands/inputs.h"
 #include "solver/joint.h"
-#include "solver/mesh.h"
 #include "solver/parallel.h"
 #include "solver/samples.h"
 #include "solver/take/atomic_file.h"
 #include "solver/take/image.h"
 #include "solver/take/json.h"
 #include "solver/take/log.h"
-#include "solver/take/take.h"
 #include "solver/vec3.h"
 
 #include <argp.h>
@@ -21,28 +20,23 @@
 #include <time.h>
 
 struct settings {
-    const char *take, *mesh, *cameras, *images, *panorama, *world_from_probe, *out, *preset, *hold_out;
+    const char *out, *preset, *hold_out;
     struct joint_settings joint;
     double w_sim;
     bool has_w_sim, no_visibility, json;
     int texture, n_lights, n_sub, n_threads;
     uint64_t seed;
+    struct inputs in;
 };
 
 enum {
-    OPTION_MESH = 256, OPTION_CAMERAS, OPTION_IMAGES, OPTION_PANORAMA, OPTION_POSE, OPTION_PRESET, OPTION_METHOD,
+    OPTION_PRESET = 512, OPTION_METHOD,
     OPTION_TEXTURE, OPTION_LIGHTS, OPTION_SUB_LIGHTS, OPTION_HOLD_OUT, OPTION_THREADS, OPTION_SEED, OPTION_JSON,
     OPTION_REFLECTANCE, OPTION_ALBEDO, OPTION_DISTANCE, OPTION_W_SIM, OPTION_NO_VISIBILITY, OPTION_ROBUST, OPTION_GAIN,
     OPTION_VERBOSE,
 };
 
 static const struct argp_option options[] = {
-    { 0, 0, 0, 0, "Input (with TAKE: in place of the take's own)", 1 },
-    { "mesh", OPTION_MESH, "FILE", 0, "OBJ, PLY, glTF or GLB with a UV atlas", 1 },
-    { "cameras", OPTION_CAMERAS, "PATH", 0, "calibrated views: a COLMAP folder", 1 },
-    { "images", OPTION_IMAGES, "DIR", 0, "linear pictures, one per view, of the view's name", 1 },
-    { "panorama", OPTION_PANORAMA, "FILE", 0, "HDR panorama of the lights", 1 },
-    { "world-from-probe", OPTION_POSE, "FILE", 0, "JSON with the rough world_from_probe and perhaps centre_m", 1 },
     { 0, 0, 0, 0, "Method", 2 },
     { "preset", OPTION_PRESET, "NAME", 0, "preview (texture 64), standard (128, default) or final (256)", 2 },
     { "method", OPTION_METHOD, "NAME", 0, "joint (default), alternating (the paper) or directional", 2 },
@@ -73,79 +67,31 @@ static const char doc[] =
     "DIR/lights.json, albedo.exr, brdf.exr, validity.exr and report.json; `rigsolve render DIR` makes pictures of it.\n\n"
     "Exit status: 0 done, 1 failed, 2 usage, 3 done, but the result is not to be trusted: the report says why.";
 
-static long integer_of(struct argp_state *state, const char *option, const char *text, long least, long most)
-{
-    char *end;
-    errno = 0;
-    const long value = strtol(text, &end, 10);
-    if (end == text || *end || errno || value < least || value > most)
-        argp_error(state, "--%s '%s': expected a whole number from %ld to %ld", option, text, least, most);
-    return value;
-}
-
-static double number_of(struct argp_state *state, const char *option, const char *text, double least, double most)
-{
-    char *end;
-    const double value = strtod(text, &end);
-    if (end == text || *end || !(value >= least && value <= most))
-        argp_error(state, "--%s '%s': expected a number from %g to %g", option, text, least, most);
-    return value;
-}
-
-static int power_of_two(struct argp_state *state, const char *option, const char *text, long most)
-{
-    const long n = integer_of(state, option, text, 1, most);
-    if (n & (n - 1))
-        argp_error(state, "--%s '%s': expected a power of two up to %ld", option, text, most);
-    return (int)n;
-}
-
-static int one_of(struct argp_state *state, const char *option, const char *text, const char *const *names, int n)
-{
-    for (int i = 0; i < n; i++)
-        if (!strcmp(text, names[i]))
-            return i;
-    argp_error(state, "--%s '%s': expected %s, %s%s%s", option, text, names[0], names[1], n > 2 ? " or " : "", n > 2 ? names[2] : "");
-    return 0;
-}
-
 static error_t parse_option(int key, char *text, struct argp_state *state)
 {
     static const char *const presets[] = { "preview", "standard", "final" }, *const models[] = { "disney", "lambert" };
     struct settings *s = state->input;
     switch (key) {
-    case OPTION_MESH:
-        s->mesh = text;
-        return 0;
-    case OPTION_CAMERAS:
-        s->cameras = text;
-        return 0;
-    case OPTION_IMAGES:
-        s->images = text;
-        return 0;
-    case OPTION_PANORAMA:
-        s->panorama = text;
-        return 0;
-    case OPTION_POSE:
-        s->world_from_probe = text;
+    case ARGP_KEY_INIT:
+        state->child_inputs[0] = &s->in;
         return 0;
     case OPTION_PRESET:
-        s->preset = presets[one_of(state, "preset", text, presets, 3)];
+        s->preset = presets[argument_choice(state, "--preset", text, presets, 3)];
         return 0;
     case OPTION_METHOD:
-        s->joint.method = (enum method)one_of(state, "method", text, method_names, 3);
+        s->joint.method = (enum method)argument_choice(state, "--method", text, method_names, 3);
         return 0;
     case OPTION_TEXTURE:
-        s->texture = (int)integer_of(state, "texture", text, 1, 4096);
+        s->texture = (int)argument_integer(state, "--texture", text, 1, 4096);
         return 0;
     case OPTION_LIGHTS:
-        s->n_lights = power_of_two(state, "lights", text, 1024);
+        s->n_lights = argument_power_of_two(state, "--lights", text, 1024);
         return 0;
     case OPTION_SUB_LIGHTS:
-        s->n_sub = power_of_two(state, "sub-lights", text, 64);
+        s->n_sub = argument_power_of_two(state, "--sub-lights", text, 64);
         return 0;
     case OPTION_REFLECTANCE:
-        s->joint.model = (enum reflectance)one_of(state, "reflectance", text, models, 2);
+        s->joint.model = (enum reflectance)argument_choice(state, "--reflectance", text, models, 2);
         return 0;
     case OPTION_ALBEDO:
         if (!strcmp(text, "free")) {
@@ -154,14 +100,14 @@ static error_t parse_option(int key, char *text, struct argp_state *state)
             s->joint.albedo = ALBEDO_SHARED;
         } else {
             s->joint.albedo = ALBEDO_GIVEN;
-            s->joint.given_albedo[0] = s->joint.given_albedo[1] = s->joint.given_albedo[2] = number_of(state, "albedo", text, 0, 1.5);
+            s->joint.given_albedo[0] = s->joint.given_albedo[1] = s->joint.given_albedo[2] = argument_number(state, "--albedo", text, "'free', 'shared' or a number", 0, 1.5);
         }
         return 0;
     case OPTION_DISTANCE:
-        s->joint.start_distance_m = number_of(state, "distance", text, .2, 50);
+        s->joint.start_distance_m = argument_number(state, "--distance", text, "metres", .2, 50);
         return 0;
     case OPTION_W_SIM:
-        s->w_sim = number_of(state, "w-sim", text, 0, 1e6);
+        s->w_sim = argument_number(state, "--w-sim", text, "a number", 0, 1e6);
         s->has_w_sim = true;
         return 0;
     case OPTION_NO_VISIBILITY:
@@ -177,14 +123,14 @@ static error_t parse_option(int key, char *text, struct argp_state *state)
         if (strncmp(text, "every:", 6) && strncmp(text, "list:", 5))
             argp_error(state, "--hold-out '%s': expected every:K or list:FILE", text);
         if (!strncmp(text, "every:", 6))
-            integer_of(state, "hold-out every", text + 6, 2, 1000);
+            argument_integer(state, "--hold-out every:", text + 6, 2, 1000);
         s->hold_out = text;
         return 0;
     case OPTION_THREADS:
-        s->n_threads = (int)integer_of(state, "threads", text, 1, 256);
+        s->n_threads = (int)argument_integer(state, "--threads", text, 1, 256);
         return 0;
     case OPTION_SEED:
-        s->seed = (uint64_t)integer_of(state, "seed", text, 0, INT32_MAX);
+        s->seed = (uint64_t)argument_integer(state, "--seed", text, 0, INT32_MAX);
         return 0;
     case OPTION_JSON:
         s->json = true;
@@ -195,14 +141,7 @@ static error_t parse_option(int key, char *text, struct argp_state *state)
     case 'o':
         s->out = text;
         return 0;
-    case ARGP_KEY_ARG:
-        if (s->take)
-            argp_error(state, "a second take '%s': expected one", text);
-        s->take = text;
-        return 0;
     case ARGP_KEY_END:
-        if (!s->take && (!s->mesh || !s->cameras || !s->images || !s->panorama))
-            argp_error(state, "expected a TAKE, or --mesh, --cameras, --images and --panorama");
         if (!s->out)
             argp_error(state, "no -o DIR: where shall the result go?");
         return 0;
@@ -214,90 +153,21 @@ static error_t parse_option(int key, char *text, struct argp_state *state)
 // ---- what is loaded -------------------------------------------------------------------------------------------------------
 
 struct scene {
-    struct take *take;
-    struct mesh mesh;
-    struct rays *rays;
-    struct texels texels;
-    struct cameras cameras;
-    struct panorama panorama;
     struct lights lights;
     struct samples samples;
-    uint8_t *held_out;
-    char **image_paths;
-    char *owned_paths[1];
+    uint8_t *held_out; // [cameras.n]
 };
 
 static void free_scene(struct scene *s)
 {
-    for (int i = 0; s->image_paths && i < s->cameras.n; i++)
-        free(s->image_paths[i]);
-    free(s->image_paths);
     free(s->held_out);
     samples_free(&s->samples);
     lights_free(&s->lights);
-    panorama_free(&s->panorama);
-    texels_free(&s->texels);
-    rays_free(s->rays);
-    mesh_free(&s->mesh);
-    cameras_free(&s->cameras);
-    take_close(s->take);
-}
-
-static int resolve_take(struct scene *scene, struct settings *s)
-{
-    if (!s->take)
-        return 0;
-    int err = take_open(&scene->take, s->take);
-    if (!err)
-        err = take_require(scene->take, (s->mesh ? 0 : TAKE_MESH) | (s->cameras ? 0 : TAKE_CAMERAS) |
-                                            (s->panorama ? 0 : TAKE_PANORAMA) | (s->images ? 0 : TAKE_VIEWS));
-    if (err)
-        return err;
-    if (!s->mesh)
-        s->mesh = scene->take->mesh_path;
-    if (!s->cameras)
-        s->cameras = scene->take->cameras_path;
-    if (!s->panorama)
-        s->panorama = scene->take->panorama_path;
-    if (!s->images)
-        s->images = scene->take->linear_dir;
-    if (!s->world_from_probe)
-        s->world_from_probe = scene->take->start_path;
-    return 0;
-}
-
-static int find_images(struct scene *scene, const struct settings *s)
-{
-    static const char *const extensions[] = { "exr", "tif", "tiff", "hdr" };
-    int n_found = 0;
-    scene->image_paths = calloc((size_t)scene->cameras.n + 1, sizeof(*scene->image_paths));
-    if (!scene->image_paths)
-        return -ENOMEM;
-    for (int v = 0; v < scene->cameras.n; v++)
-        for (int k = 0; k < 4 && !scene->image_paths[v]; k++) {
-            char *path;
-            if (asprintf(&path, "%s/%s.%s", s->images, scene->cameras.view[v].name, extensions[k]) < 0)
-                return -ENOMEM;
-            FILE *f = fopen(path, "re");
-            if (f)
-                fclose(f), scene->image_paths[v] = path, n_found++;
-            else
-                free(path);
-        }
-    if (!n_found) {
-        log_error("solve: %s: no picture has the name of a camera, as %s.exr; expected one per view", s->images,
-                  scene->cameras.view[0].name);
-        return -ENOENT;
-    }
-    if (n_found < scene->cameras.n)
-        log_warning("solve: %s: %d of %d cameras have no picture: they are left out", s->images, scene->cameras.n - n_found,
-                    scene->cameras.n);
-    return 0;
 }
 
 static int choose_held_out(struct scene *scene, const struct settings *s)
 {
-    const struct cameras *c = &scene->cameras;
+    const struct cameras *c = &s->in.cameras;
     scene->held_out = calloc((size_t)c->n + 1, 1);
     if (!scene->held_out)
         return -ENOMEM;
@@ -329,58 +199,23 @@ static int choose_held_out(struct scene *scene, const struct settings *s)
     return 0;
 }
 
-static int load_lights(struct scene *scene, const struct settings *s)
-{
-    struct lights *l = &scene->lights;
-    int err = panorama_read(&scene->panorama, s->panorama);
-    if (!err)
-        err = lights_median_cut(l, &scene->panorama, s->n_lights * s->n_sub);
-    if (err)
-        return err;
-    for (int i = 0; i < l->n; i++) // aligned runs are the regions of the coarser cut
-        l->group[i] = i / s->n_sub;
-    for (int c = 0; c < 3; c++)
-        l->centre_m[c] = (scene->mesh.bounds_m[0][c] + scene->mesh.bounds_m[1][c]) / 2;
-    if (!s->world_from_probe) {
-        log_warning("solve: no --world-from-probe: the panorama is taken to have the world's axes");
-        return 0;
-    }
-    struct json *pose = NULL;
-    err = json_read(&pose, s->world_from_probe);
-    if (!err)
-        err = json_require_numbers(pose, "world_from_probe", l->world_from_probe, 9, s->world_from_probe);
-    if (!err && json_get(pose, "centre_m"))
-        err = json_require_numbers(pose, "centre_m", l->centre_m, 3, s->world_from_probe);
-    json_free(pose);
-    return err;
-}
-
 static int load(struct scene *scene, struct settings *s)
 {
-    struct mesh_check check;
-    int err = resolve_take(scene, s);
-    if (!err)
-        err = mesh_read(&scene->mesh, &check, s->mesh);
-    if (err)
-        return err;
-    mesh_check_log(&check, &scene->mesh, s->mesh);
-    err = texels_rasterise(&scene->texels, &scene->mesh, s->texture);
-    if (!err)
-        err = rays_new(&scene->rays, &scene->mesh);
-    if (!err)
-        err = cameras_read(&scene->cameras, s->cameras);
-    if (!err)
-        err = find_images(scene, s);
+    struct samples_settings gather = samples_defaults();
+    gather.n_threads = s->n_threads;
+    s->in.needs = TAKE_MESH | TAKE_CAMERAS | TAKE_PANORAMA | TAKE_VIEWS;
+    s->in.texture = s->texture;
+    int err = inputs_load(&s->in);
     if (!err)
         err = choose_held_out(scene, s);
     if (!err)
-        err = load_lights(scene, s);
+        err = inputs_lights(&scene->lights, &s->in, NULL, s->n_lights * s->n_sub);
+    for (int i = 0; !err && i < scene->lights.n; i++)
+        scene->lights.group[i] = i / s->n_sub; // aligned runs are the regions of the coarser cut
     if (err)
         return err;
-    struct samples_settings gather = samples_defaults();
-    gather.n_threads = s->n_threads;
-    return samples_gather(&scene->samples, &scene->texels, scene->rays, &scene->cameras,
-                          (const char *const *)scene->image_paths, &gather);
+    return samples_gather(&scene->samples, &s->in.texels, s->in.rays, &s->in.cameras, (const char *const *)s->in.picture,
+                          &gather);
 }
 
 // ---- what is written ------------------------------------------------------------------------------------------------------
@@ -392,10 +227,10 @@ static double wall_s(void)
     return (double)t.tv_sec + 1e-9 * (double)t.tv_nsec;
 }
 
-static int write_texture(const struct scene *scene, const struct settings *s, const char *name, int n_channels,
+static int write_texture(const struct settings *s, const char *name, int n_channels,
                          const char *const *names, const float *constant, const float (*per_texel)[3])
 {
-    const struct texels *t = &scene->texels;
+    const struct texels *t = &s->in.texels;
     struct image image;
     char *path;
     if (asprintf(&path, "%s/%s", s->out, name) < 0)
@@ -428,9 +263,6 @@ static struct json *make_report(const struct scene *scene, const struct settings
 {
     struct rusage use;
     getrusage(RUSAGE_SELF, &use);
-    int n_views = 0;
-    for (int v = 0; v < scene->cameras.n; v++)
-        n_views += scene->image_paths[v] != NULL;
     struct json *o = json_object(), *warnings = json_array(), *inputs = json_object(), *stages = json_object(),
                 *stage1 = json_object();
     json_set_string(o, "method", method_names[s->joint.method]);
@@ -441,7 +273,7 @@ static struct json *make_report(const struct scene *scene, const struct settings
     json_set_number(o, "cpu_s", (double)(use.ru_utime.tv_sec + use.ru_stime.tv_sec) +
                                     1e-6 * (double)(use.ru_utime.tv_usec + use.ru_stime.tv_usec));
     json_set_int(o, "peak_rss_bytes", (int64_t)use.ru_maxrss * 1024);
-    json_set_int(o, "n_views", n_views);
+    json_set_int(o, "n_views", s->in.n_pictures);
     json_set_int(o, "n_lights", s->n_lights);
     json_set_int(o, "n_sub_lights", s->n_sub);
     json_set_int(o, "texture", s->texture);
@@ -473,8 +305,8 @@ static struct json *make_report(const struct scene *scene, const struct settings
     json_set_int(stage1, "iterations", r->n_jacobians);
     json_set(stages, "joint", stage1);
     json_set(o, "stages", stages);
-    char *mesh = realpath(s->mesh, NULL);
-    json_set_string(inputs, "mesh", mesh ? mesh : s->mesh);
+    char *mesh = realpath(s->in.mesh_path, NULL);
+    json_set_string(inputs, "mesh", mesh ? mesh : s->in.mesh_path);
     free(mesh);
     json_set(o, "inputs", inputs);
     return o;
@@ -496,21 +328,21 @@ static int write_result(const struct scene *scene, const struct settings *s, con
     memcpy(solved.world_from_probe, r->state.lights.world_from_probe, sizeof(solved.world_from_probe));
     if (!err)
         err = lights_write_json(&solved, lights);
-    float(*albedo)[3] = malloc((size_t)scene->texels.n * sizeof(*albedo));
-    float(*seen)[3] = malloc((size_t)scene->texels.n * sizeof(*seen));
+    float(*albedo)[3] = malloc((size_t)s->in.texels.n * sizeof(*albedo));
+    float(*seen)[3] = malloc((size_t)s->in.texels.n * sizeof(*seen));
     if (!err && (!albedo || !seen))
         err = -ENOMEM;
-    for (int t = 0; !err && t < scene->texels.n; t++)
+    for (int t = 0; !err && t < s->in.texels.n; t++)
         for (int c = 0; c < 3; c++) {
             albedo[t][c] = s->joint.albedo == ALBEDO_SHARED ? (float)r->state.shared_albedo[c] : r->state.albedo[t][c];
             seen[t][c] = (float)(scene->samples.first[t + 1] > scene->samples.first[t]);
         }
     if (!err)
-        err = write_texture(scene, s, "albedo.exr", 3, NULL, NULL, (const float(*)[3])albedo);
+        err = write_texture(s, "albedo.exr", 3, NULL, NULL, (const float(*)[3])albedo);
     if (!err)
-        err = write_texture(scene, s, "validity.exr", 3, NULL, NULL, (const float(*)[3])seen);
+        err = write_texture(s, "validity.exr", 3, NULL, NULL, (const float(*)[3])seen);
     if (!err && s->joint.model == REFLECT_DISNEY)
-        err = write_texture(scene, s, "brdf.exr", DISNEY_N, disney_parameter_names, theta, NULL);
+        err = write_texture(s, "brdf.exr", DISNEY_N, disney_parameter_names, theta, NULL);
     if (!err)
         err = json_write(report, path);
     free(albedo);
@@ -537,7 +369,9 @@ static void print_summary(const struct settings *s, const struct joint_result *r
 
 int command_solve(int argc, char **argv)
 {
-    const struct argp argp = { options, parse_option, "TAKE -o DIR\n--mesh M --cameras C --images DIR --panorama P -o DIR", doc, 0, 0, 0 };
+    const struct argp_child children[] = { { &inputs_argp, 0, NULL, 0 }, { 0 } };
+    const struct argp argp = { options, parse_option, "TAKE -o DIR\n--mesh M --cameras C --images DIR --panorama P -o DIR", doc,
+                               children, 0, 0 };
     struct settings s = { .preset = "standard", .n_lights = 256, .hold_out = "every:7", .seed = 1 };
     struct scene scene = { 0 };
     struct joint_result result = { 0 };
@@ -556,7 +390,7 @@ int command_solve(int argc, char **argv)
     int err = load(&scene, &s);
     const double stage_begin = wall_s();
     if (!err)
-        err = joint_solve(&result, &scene.texels, &scene.samples, scene.rays, &scene.lights, s.n_lights, scene.held_out,
+        err = joint_solve(&result, &s.in.texels, &scene.samples, s.in.rays, &scene.lights, s.n_lights, scene.held_out,
                           &s.joint);
     if (!err) {
         struct json *report = make_report(&scene, &s, &result, wall_s() - begin, wall_s() - stage_begin);
@@ -573,5 +407,6 @@ int command_solve(int argc, char **argv)
     const int code = err ? EXIT_FAILED : result.doubts ? EXIT_NOT_TRUSTED : EXIT_DONE;
     joint_result_free(&result);
     free_scene(&scene);
+    inputs_free(&s.in);
     return code;
 }
