@@ -57,7 +57,7 @@ solve() { # set, take, folder, method
     "$rigsolve" solve "$2" -o "$3" --method "$4" $material $solve_options >"$3/log" 2>&1 || code=$?
     case $code in
     0|3) ;;
-    *) say "solve failed ($code): $(grep -a . "$3/log" | tail -n 1)"; return 0 ;;
+    *) say "solve failed ($code): $(grep -av '^Try ' "$3/log" | tail -n 1)"; return 0 ;;
     esac
     if "$judge" "$3" "$2" --json >"$3/judge.part" && "$judge" "$3" "$2" >&2; then
         mv "$3/judge.part" "$3/judge.json"
