@@ -36,7 +36,7 @@ make_take() { # set, seed, noise
     case $1 in
     pebble|vase) take=../shared/data/studio-$1; [ -d "$take" ] || { say "no $take: left out"; return 1; }; return 0 ;;
     esac
-    take=$out/takes/$1-seed$2-noise$3-$(printf '%s' "$synth_options" | tr -c 'A-Za-z0-9.' '_')
+    take=$out/takes/$1-seed$2-noise$3-$(printf '%s' "$synth_options" | sed 's/--//g' | tr -cs 'A-Za-z0-9.' _)
     [ -d "$take" ] || [ $table_only = 1 ] && return 0
     say "$1 seed $2 noise $3: synth"
     # shellcheck disable=SC2086
@@ -50,14 +50,14 @@ solve() { # set, take, folder, method
     pebble|vase) material="--hold-out list:$2/unseen.txt" ;;
     *) material= ;;
     esac
-    rm -f "$3/judge.json" "$3/lights.json" "$3/report.json" "$3/albedo.exr" "$3/brdf.exr" "$3/validity.exr"
+    rm -f "$3/judge.json" "$3/judge.part" "$3/lights.json" "$3/report.json" "$3/albedo.exr" "$3/brdf.exr" "$3/validity.exr"
     mkdir -p "$3"
     code=0
     # shellcheck disable=SC2086
     "$rigsolve" solve "$2" -o "$3" --method "$4" $material $solve_options >"$3/log" 2>&1 || code=$?
     case $code in
     0|3) ;;
-    *) say "solve failed ($code): $(grep -a . "$3/log" | tail -n 1)"; return 0 ;;
+    *) say "solve failed ($code): $(grep -av '^Try ' "$3/log" | tail -n 1)"; return 0 ;;
     esac
     if "$judge" "$3" "$2" --json >"$3/judge.part" && "$judge" "$3" "$2" >&2; then
         mv "$3/judge.part" "$3/judge.json"
@@ -102,12 +102,12 @@ perl -MJSON::PP -e '
     while (<>) {
         chomp;
         my ($set, $seed, $noise, $method, $file) = split /\t/;
-        my $text = open(my $f, "<", $file) ? do { local $/; <$f> } : undef;
-        if (!defined $text) {
+        my $f;
+        if (!open($f, "<", $file)) {
             print "| $set | $seed | $noise | $method | no result |", " |" x 10, "\n";
             next;
         }
-        my $j = decode_json($text);
+        my $j = decode_json(do { local $/; <$f> });
         my ($worst, $name);
         for (sort keys %{$j->{theta_error}}) {
             my $e = $j->{theta_error}{$_};
