@@ -266,7 +266,7 @@ static void set_bounds(struct stage1 *s)
         s->lower[l->rotation + i] = -1, s->upper[l->rotation + i] = 1;
     }
     for (int g = 0; g < l->n_groups; g++) {
-        s->lower[l->inverse_distance + g] = s->in_distance ? 1 / most_q : least_q;
+        s->lower[l->inverse_distance + g] = s->set->method == METHOD_DIRECTIONAL ? 0 : s->in_distance ? 1 / most_q : least_q;
         s->upper[l->inverse_distance + g] = s->in_distance ? 1 / least_q : most_q;
     }
 }
@@ -441,50 +441,56 @@ static int sweep(const struct photometric *p, const struct lights *lights, const
     return err;
 }
 
-// Continuation: w_sim falls by decades; after each the views set aside are measured, and the best set-up is kept.
+// Half floats and bilinear look-ups leave about this much (percent of white) in any comparison; to gain less is to gain nothing.
+static const double floor_percent = .03;
+
+// Continuation: w_sim falls by decades, and after each step the views set aside are measured. Kept is the *largest* weight whose
+// error is within 3 % of the best, or within the pictures' own rounding: below that, lights that the pictures hardly see drift off
+// for nothing.
 static int continuation(struct stage1 *s, const uint8_t *aside)
 {
-    const int full_step = 1, coarse_step = s->p.texels->n > 2000 ? s->p.texels->n / 2000 + 1 - s->p.texels->n / 2000 % 2 : 1;
-    struct photometric_state best = { 0 };
-    double best_error = INFINITY, best_w = 0;
-    int n_worse = 0, err = photometric_state_new(&best, &s->p, &s->base.lights);
+    enum { MAX_STEPS = 12 };
+    const int few = s->p.texels->n / 2000, coarse_step = few > 1 ? few + 1 - few % 2 : 1;
     const double last = s->set->w_sim >= 0 ? s->set->w_sim : 0;
-    progress_begin("joint", 12);
-    for (double w = 1e-4; !err; w = w > 1e-13 ? w / 10 : 0) {
+    struct photometric_state at[MAX_STEPS] = { { .theta = { 0 } } };
+    double error[MAX_STEPS], weight[MAX_STEPS], best = INFINITY;
+    int n = 0, n_worse = 0, chosen = 0, err = 0;
+    progress_begin("joint", MAX_STEPS);
+    for (double w = 1e-4; !err && n < MAX_STEPS; w = w > 1e-13 ? w / 10 : 0) {
         struct photometric_error e;
-        if (w < last)
-            w = last;
-        s->w_sim = w;
+        s->w_sim = weight[n] = w > last ? w : last;
         s->p.texel_step = coarse_step;
         trace_visibility(s);
         err = minimise(s, 6, 1e-2, NULL);
-        // The albedo of every texel, for the views set aside.
-        s->p.texel_step = full_step;
-        if (!err)
+        s->p.texel_step = 1;
+        if (!err) // the albedo of every texel, for the views set aside
             err = photometric_evaluate(&s->p, &s->base, s->p.albedo == ALBEDO_FREE, &e);
         if (!err)
             err = measure(s, &s->base, aside, &e);
-        const double error = photometric_rmse_percent(&e);
-        log_debug("joint: w_sim %.0e: views set aside %.4f %%", w, error);
+        if (!err)
+            err = photometric_state_new(&at[n], &s->p, &s->base.lights);
         progress_add(1);
         if (err)
             break;
-        n_worse = error < best_error * .97 ? 0 : n_worse + 1; // little gained counts as none
-        if (error < best_error) {
-            best_error = error, best_w = w;
-            photometric_state_copy(&s->p, &best, &s->base);
-        }
-        if (n_worse == 3 && s->set->w_sim < 0)
-            break;
-        if (w <= last)
+        photometric_state_copy(&s->p, &at[n], &s->base);
+        error[n] = photometric_rmse_percent(&e);
+        log_debug("joint: w_sim %.0e: views set aside %.4f %%", w, error[n]);
+        n_worse = error[n] < .97 * best ? 0 : n_worse + 1;
+        best = fmin(best, error[n++]);
+        if (w <= last || (s->set->w_sim < 0 && n_worse == 3))
             break;
     }
     if (!err) {
-        photometric_state_copy(&s->p, &s->base, &best);
-        s->w_sim = s->set->w_sim >= 0 ? last : best_w;
+        for (chosen = 0; s->set->w_sim < 0 && error[chosen] > hypot(1.03 * best, floor_percent);)
+            chosen++;
+        if (s->set->w_sim >= 0)
+            chosen = n - 1;
+        photometric_state_copy(&s->p, &s->base, &at[chosen]);
+        s->w_sim = weight[chosen];
     }
     progress_end();
-    photometric_state_free(&best);
+    for (int i = 0; i < MAX_STEPS; i++)
+        photometric_state_free(&at[i]);
     return err;
 }
 
