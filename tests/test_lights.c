@@ -7,6 +7,7 @@
 #include "solver/random.h"
 #include "solver/take/log.h"
 #include "solver/vec3.h"
+#include "tests/scratch.h"
 
 #include <errno.h>
 #include <setjmp.h>
@@ -478,28 +479,16 @@ static void photographed_studios_keep_their_energy(void **state)
 
 // ---- lights.json --------------------------------------------------------------------------------
 
-static char folder[64]; // of this run, removed at the end
-
 static int make_folder(void **state)
 {
     (void)state;
-    snprintf(folder, sizeof(folder), "/tmp/studiorig-test-XXXXXX");
-    return mkdtemp(folder) ? 0 : -1;
+    return scratch_open();
 }
 
 static int remove_folder(void **state)
 {
     (void)state;
-    return rmdir(folder); // fails if a test or a writer left something behind
-}
-
-static const char *in_folder(const char *name)
-{
-    static char path[2][128];
-    static int turn;
-    turn = !turn;
-    snprintf(path[turn], sizeof(path[turn]), "%s/%s", folder, name);
-    return path[turn];
+    return scratch_close();
 }
 
 // A set-up anywhere in a hall. What of its lights: 0 all have distances, 1 every third, 2 none,
@@ -574,7 +563,7 @@ static void compare_set_ups(struct worst *w, const struct lights *a, const struc
 static void through_files(struct worst *w, const struct lights *l)
 {
     struct lights back, third;
-    const char *path = in_folder("lights.json");
+    const char *path = scratch_path("lights.json");
     assert_int_equal(lights_write_json(l, path), 0);
     assert_int_equal(lights_read_json(&back, path), 0);
     assert_int_equal(lights_write_json(&back, path), 0);
@@ -642,7 +631,7 @@ static void lights_far_away_do_not_move_the_centre(void **state)
     struct lights l = random_set_up(64, 0, 2000), back;
     for (int i = 32; i < 64; i++)
         l.inverse_distance[i] = (const double[]){1e-6, 1e-14, 1e-17, 1e-300}[i % 4];
-    const char *path = in_folder("far.json");
+    const char *path = scratch_path("far.json");
     assert_int_equal(lights_write_json(&l, path), 0);
     assert_int_equal(lights_read_json(&back, path), 0);
     unlink(path);
@@ -659,7 +648,7 @@ static void the_file_is_a_list_that_says_where_lights_are_in_the_world(void **st
     (void)state;
     struct lights l = near_lights(8), plain;
     struct json *doc;
-    const char *path = in_folder("list.json");
+    const char *path = scratch_path("list.json");
     assert_int_equal(lights_write_json(&l, path), 0);
     assert_int_equal(json_read(&doc, path), 0);
     assert_int_equal(json_length(doc, ""), 8);
@@ -855,7 +844,7 @@ static void wrong_lights_are_refused_by_name(void **state)
             fail_msg("broken %zu: said \"%s\"", i, last_error);
     }
     log_set_hook(NULL, NULL);
-    assert_int_equal(lights_read_json(&l, in_folder("not-there.json")), -ENOENT);
+    assert_int_equal(lights_read_json(&l, scratch_path("not-there.json")), -ENOENT);
 }
 
 static void more_lights_than_the_limit_are_refused(void **state)
@@ -903,7 +892,7 @@ static void what_a_hand_may_write_is_read(void **state)
 
 static int read_pose(struct lights *l, bool *has_centre, const char *rows, const char *rest)
 {
-    const char *path = in_folder("pose.json");
+    const char *path = scratch_path("pose.json");
     FILE *f = fopen(path, "w");
     assert_non_null(f);
     fprintf(f, "{\"note\": \"by hand\", \"world_from_probe\": %s%s}\n", rows, rest);
