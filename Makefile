@@ -76,6 +76,7 @@ $(BUILD)/tests/%: $(BUILD)/obj/tests/%.o $(BUILD)/libstudiorig.a
 	@mkdir -p $(@D)
 	@$(if $(V),,echo '  LD $@')
 	$(Q)$(CC) $(CFLAGS_ALL) $^ -lcmocka $(LIBS) -o $@
+$(BUILD)/tests/test_pcg: LIBS += $(if $(wildcard /usr/include/suitesparse/cholmod.h),-lcholmod)
 $(BUILD)/fuzz/obj/%.o: %.c Makefile | deps-fuzz
 	@mkdir -p $(@D)
 	@$(if $(V),,echo '  CC (fuzz) $<')

@@ -150,8 +150,8 @@ static int evaluate(const struct lm_problem *p, struct scratch *s, const double 
     return err;
 }
 
-// A step with the damping mu, cut off at the bounds: variables that a step would carry over a bound stop there, and the others are
-// solved for again, at most a few times. False: not positive definite.
+// A step with the damping mu, cut off at the bounds: variables on a bound that the step would carry over it stay there, and the others
+// are solved for again, at most a few times. False: not positive definite.
 static bool find_step(const struct lm_problem *p, struct scratch *s, const double *x, const double *scale,
                       double mu)
 {
