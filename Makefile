@@ -39,7 +39,7 @@ KERNELS := $(addprefix solver/kernels/,kernels.c kernels_ref.c kernels_portable.
 COMMANDS := $(addprefix solver/commands/,arguments.c brdf.c compare.c inputs.c lights.c output.c render.c solve.c synth.c visibility.c)
 LIBRARY := $(TAKE) $(SOLVER) $(KERNELS)
 FUZZED := $(TAKE) $(filter-out %/render.c %/synth.c,$(SOLVER))
-TESTS := $(addprefix test_,brdf cameras compare csv disney image json lights lm mesh normal_equations orientation panorama parallel pcg photometric rays render samples shapes synth take texels vec3 visibility) check_kernels
+TESTS := $(addprefix test_,brdf cameras compare csv disney image json judge lights lm mesh normal_equations orientation panorama parallel pcg photometric rays render samples shapes synth take texels vec3 visibility) check_kernels
 FUZZERS := cameras csv exr hdr json lights mesh
 
 # ---- rules --------------------------------------------------------------------------------------------------------------
@@ -129,7 +129,7 @@ stability: deps deps-bench $(BUILD)/tests/bench/stability_kernels
 	@echo "stability: build/stability/kernels.csv .svg .png: where float32 fails, over roughness and elevation"
 
 # ---- installation ---------------------------------------------------------------------------------------------------------
-MAN := $(addprefix $(BUILD)/man/rigsolve,.1 $(addprefix -,$(addsuffix .1,$(notdir $(COMMANDS:.c=)))))
+MAN := $(addprefix $(BUILD)/man/rigsolve,.1 $(addprefix -,$(addsuffix .1,$(filter-out arguments inputs output,$(notdir $(COMMANDS:.c=))))))
 man: $(MAN)
 $(BUILD)/man/rigsolve.1: $(BUILD)/bin/rigsolve
 	@mkdir -p $(@D)
