@@ -36,7 +36,7 @@ SOLVER := $(addprefix solver/,cameras.c cameras_colmap.c compare.c csv.c disney.
   normal_equations.c orientation.c panorama.c parallel.c pcg.c photometric.c rays.c render.c samples.c shapes.c synth.c \
   texels.c visibility.c)
 KERNELS := $(addprefix solver/kernels/,kernels.c kernels_ref.c kernels_portable.c kernels_avx2.c kernels_avx512.c)
-COMMANDS := $(addprefix solver/commands/,brdf.c compare.c lights.c render.c solve.c synth.c visibility.c)
+COMMANDS := $(addprefix solver/commands/,arguments.c brdf.c compare.c inputs.c lights.c output.c render.c solve.c synth.c visibility.c)
 LIBRARY := $(TAKE) $(SOLVER) $(KERNELS)
 FUZZED := $(TAKE) $(filter-out %/render.c %/synth.c,$(SOLVER))
 TESTS := $(addprefix test_,brdf cameras compare csv disney image json lights lm mesh normal_equations orientation panorama parallel pcg photometric rays render samples shapes synth take texels vec3 visibility) check_kernels

@@ -266,7 +266,7 @@ static void set_bounds(struct stage1 *s)
         s->lower[l->rotation + i] = -1, s->upper[l->rotation + i] = 1;
     }
     for (int g = 0; g < l->n_groups; g++) {
-        s->lower[l->inverse_distance + g] = s->in_distance ? 1 / most_q : least_q;
+        s->lower[l->inverse_distance + g] = s->set->method == METHOD_DIRECTIONAL ? 0 : s->in_distance ? 1 / most_q : least_q;
         s->upper[l->inverse_distance + g] = s->in_distance ? 1 / least_q : most_q;
     }
 }
@@ -383,9 +383,32 @@ static int measure(const struct stage1 *s, const struct photometric_state *state
     return photometric_evaluate(&p, (struct photometric_state *)state, false, e);
 }
 
+// Runs of `run` lights become one: the sum of their irradiance, from its mean direction.
+static int merge_lights(struct lights *out, const struct lights *fine, int run)
+{
+    const int err = lights_new(out, fine->n / run);
+    if (err)
+        return err;
+    memcpy(out->centre_m, fine->centre_m, sizeof(out->centre_m));
+    memcpy(out->world_from_probe, fine->world_from_probe, sizeof(out->world_from_probe));
+    for (int i = 0; i < out->n; i++) {
+        double d[3] = { 0 };
+        for (int k = i * run; k < (i + 1) * run; k++) {
+            const double *C = fine->irradiance[k];
+            vec3_add_scaled(d, d, C[0] + C[1] + C[2], fine->dir_probe[k]);
+            vec3_add_scaled(out->irradiance[i], out->irradiance[i], 1, C);
+        }
+        if (vec3_normalise(d) == 0)
+            memcpy(d, fine->dir_probe[i * run], sizeof(d));
+        memcpy(out->dir_probe[i], d, sizeof(d));
+        out->inverse_distance[i] = fine->inverse_distance[i * run];
+    }
+    return 0;
+}
+
 // The common distance of all lights, by brute trial at few texels: one group, so a Jacobian costs little.
 static int sweep(const struct photometric *p, const struct lights *lights, const struct rays *rays,
-                 const struct joint_settings *set, struct photometric_state *best, double *best_cost)
+                 const struct joint_settings *set, struct photometric_state *best, double *best_cost, int *n_jacobians)
 {
     static const double distances_m[] = { .7, 1.1, 1.7, 2.6, 4 };
     int32_t *one_group = calloc((size_t)lights->n, sizeof(*one_group));
@@ -411,84 +434,75 @@ static int sweep(const struct photometric *p, const struct lights *lights, const
             *best_cost = cost;
             photometric_state_copy(&coarse, best, &s.base);
         }
+        *n_jacobians += s.n_jacobians;
         stage1_free(&s);
     }
     free(one_group);
     return err;
 }
 
-// Continuation: w_sim falls by decades; after each the views set aside are measured, and the best set-up is kept.
+// Half floats and bilinear look-ups leave about this much (percent of white) in any comparison; to gain less is to gain nothing.
+static const double floor_percent = .03;
+
+// Continuation: w_sim falls by decades, and after each step the views set aside are measured. Kept is the *largest* weight whose
+// error is within 3 % of the best, or within the pictures' own rounding: below that, lights that the pictures hardly see drift off
+// for nothing.
 static int continuation(struct stage1 *s, const uint8_t *aside)
 {
-    const int full_step = 1, coarse_step = s->p.texels->n > 6000 ? 3 : 1;
-    struct photometric_state best = { 0 };
-    double best_error = INFINITY, best_w = 0;
-    int n_worse = 0, err = photometric_state_new(&best, &s->p, &s->base.lights);
+    enum { MAX_STEPS = 12 };
+    const int few = s->p.texels->n / 2000, coarse_step = few > 1 ? few + 1 - few % 2 : 1;
     const double last = s->set->w_sim >= 0 ? s->set->w_sim : 0;
-    progress_begin("joint", 14);
-    for (double w = 1e-3; !err; w = w > 1e-12 ? w / 10 : 0) {
+    struct photometric_state at[MAX_STEPS] = { { .theta = { 0 } } };
+    double error[MAX_STEPS], weight[MAX_STEPS], best = INFINITY;
+    int n = 0, n_worse = 0, chosen = 0, err = 0;
+    progress_begin("joint", MAX_STEPS);
+    for (double w = 1e-4; !err && n < MAX_STEPS; w = w > 1e-13 ? w / 10 : 0) {
         struct photometric_error e;
-        if (w < last)
-            w = last;
-        s->w_sim = w;
+        s->w_sim = weight[n] = w > last ? w : last;
         s->p.texel_step = coarse_step;
         trace_visibility(s);
-        err = minimise(s, 8, 1e-3, NULL);
-        // The albedo of every texel, for the views set aside.
-        s->p.texel_step = full_step;
-        if (!err)
+        err = minimise(s, 6, 1e-2, NULL);
+        s->p.texel_step = 1;
+        if (!err) // the albedo of every texel, for the views set aside
             err = photometric_evaluate(&s->p, &s->base, s->p.albedo == ALBEDO_FREE, &e);
         if (!err)
             err = measure(s, &s->base, aside, &e);
-        const double error = photometric_rmse_percent(&e);
-        log_debug("joint: w_sim %.0e: views set aside %.4f %%", w, error);
+        if (!err)
+            err = photometric_state_new(&at[n], &s->p, &s->base.lights);
         progress_add(1);
         if (err)
             break;
-        if (error < best_error * .9995) {
-            best_error = error, best_w = w, n_worse = 0;
-            photometric_state_copy(&s->p, &best, &s->base);
-        } else if (++n_worse == 3 && s->set->w_sim < 0) {
-            break;
-        }
-        if (w <= last)
+        photometric_state_copy(&s->p, &at[n], &s->base);
+        error[n] = photometric_rmse_percent(&e);
+        log_debug("joint: w_sim %.0e: views set aside %.4f %%", w, error[n]);
+        n_worse = error[n] < .97 * best ? 0 : n_worse + 1;
+        best = fmin(best, error[n++]);
+        if (w <= last || (s->set->w_sim < 0 && n_worse == 3))
             break;
     }
     if (!err) {
-        photometric_state_copy(&s->p, &s->base, &best);
-        s->w_sim = s->set->w_sim >= 0 ? last : best_w;
+        for (chosen = 0; s->set->w_sim < 0 && error[chosen] > hypot(1.03 * best, floor_percent);)
+            chosen++;
+        if (s->set->w_sim >= 0)
+            chosen = n - 1;
+        photometric_state_copy(&s->p, &s->base, &at[chosen]);
+        s->w_sim = weight[chosen];
     }
     progress_end();
-    photometric_state_free(&best);
+    for (int i = 0; i < MAX_STEPS; i++)
+        photometric_state_free(&at[i]);
     return err;
 }
 
-static int solve_joint(struct stage1 *s, const uint8_t *fit, struct joint_result *out)
+// The last word: all texels, all fitted views, the finest lights.
+static int refine(struct stage1 *s, const uint8_t *fit)
 {
-    const int n_views = s->layout.n_views;
-    uint8_t *inner = malloc((size_t)n_views), *aside = malloc((size_t)n_views);
     float *weight = NULL;
-    int err = inner && aside ? 0 : -ENOMEM, seen = 0;
-    for (int v = 0; !err && v < n_views; v++) {
-        aside[v] = fit[v] && seen++ % 6 == 3;
-        inner[v] = fit[v] && !aside[v];
-    }
-    if (err)
-        goto end;
-    if (s->set->method == METHOD_JOINT) {
-        s->p.use_view = seen >= 8 ? inner : fit;
-        err = continuation(s, seen >= 8 ? aside : fit);
-    } else {
-        set_distances(s, 0);
-        s->w_sim = 0;
-        s->lower[0] = 0;
-    }
-    if (err)
-        goto end;
+    int err = 0;
     s->p.use_view = fit;
     s->p.texel_step = 1;
     trace_visibility(s);
-    if (s->set->robust && s->set->method == METHOD_JOINT) {
+    if (s->set->robust) {
         double sigma;
         weight = malloc((size_t)s->p.samples->n * sizeof(float) + 1);
         err = weight ? photometric_scale(&s->p, &s->base, &sigma) : -ENOMEM;
@@ -497,11 +511,79 @@ static int solve_joint(struct stage1 *s, const uint8_t *fit, struct joint_result
         s->p.weight = weight;
     }
     if (!err)
-        err = minimise(s, s->set->method == METHOD_JOINT ? 20 : 40, 1e-5, NULL);
-    (void)out;
-end:
+        err = minimise(s, s->set->method == METHOD_JOINT ? 15 : 40, 1e-4, NULL);
     s->p.weight = NULL;
     free(weight);
+    return err;
+}
+
+// Sweep, continuation with coarse lights and texels, refinement. s is made for the finest lights.
+static int solve_joint(struct stage1 *s, const struct photometric *p, const struct lights *lights, const uint8_t *fit,
+                       struct joint_result *out)
+{
+    const int n_views = s->layout.n_views, run = lights->n / p->n_groups, coarse_run = run < 4 ? run : 4;
+    struct lights one = { 0 }, few = { 0 };
+    struct photometric coarse = *p;
+    struct photometric_state start = { 0 };
+    struct stage1 c = { 0 };
+    double cost, mirrored_cost;
+    int32_t *group = malloc((size_t)lights->n * sizeof(*group));
+    uint8_t *inner = malloc((size_t)n_views), *aside = malloc((size_t)n_views);
+    int err = group && inner && aside ? 0 : -ENOMEM, seen = 0;
+    for (int v = 0; !err && v < n_views; v++) {
+        aside[v] = fit[v] && seen++ % 6 == 3;
+        inner[v] = fit[v] && !aside[v];
+    }
+    if (!err)
+        err = merge_lights(&one, lights, run);
+    if (!err)
+        err = merge_lights(&few, lights, run / coarse_run);
+    if (err)
+        goto end;
+    coarse.group_of_light = group;
+    for (int i = 0; i < one.n; i++)
+        group[i] = i;
+    err = photometric_state_new(&start, &coarse, &one);
+    if (!err)
+        err = sweep(&coarse, &one, s->rays, s->set, &start, &cost, &s->n_jacobians);
+    if (!err) { // is the panorama mirrored?
+        struct photometric_state unused = { 0 };
+        for (int i = 0; i < one.n; i++)
+            one.dir_probe[i][0] *= -1;
+        err = photometric_state_new(&unused, &coarse, &one);
+        if (!err)
+            err = sweep(&coarse, &one, s->rays, s->set, &unused, &mirrored_cost, &s->n_jacobians);
+        photometric_state_free(&unused);
+        if (!err && mirrored_cost < .5 * cost)
+            out->doubts |= DOUBT_MIRRORED;
+    }
+    if (err)
+        goto end;
+    photometric_pack(&coarse, &start, s->x);
+    for (int i = 0; i < few.n; i++)
+        group[i] = i / coarse_run;
+    err = stage1_new(&c, &coarse, &few, s->rays, s->set);
+    if (err)
+        goto end;
+    memcpy(c.base.lights.world_from_probe, start.lights.world_from_probe, sizeof(start.lights.world_from_probe));
+    photometric_unpack(&c.p, &c.base, s->x);
+    c.p.use_view = seen >= 8 ? inner : fit;
+    err = continuation(&c, seen >= 8 ? aside : fit);
+    if (err)
+        goto end;
+    photometric_pack(&c.p, &c.base, s->x);
+    memcpy(s->base.lights.world_from_probe, c.base.lights.world_from_probe, sizeof(start.lights.world_from_probe));
+    photometric_unpack(&s->p, &s->base, s->x);
+    memcpy(s->base.albedo, c.base.albedo, (size_t)p->texels->n * sizeof(*c.base.albedo));
+    s->w_sim = c.w_sim;
+    s->n_jacobians += c.n_jacobians, s->n_evaluations += c.n_evaluations;
+    err = refine(s, fit);
+end:
+    stage1_free(&c);
+    photometric_state_free(&start);
+    lights_free(&one);
+    lights_free(&few);
+    free(group);
     free(inner);
     free(aside);
     return err;
@@ -694,17 +776,20 @@ static void doubt(const struct stage1 *s, struct joint_result *out, int n_fit_vi
 }
 
 int joint_solve(struct joint_result *out, const struct texels *texels, const struct samples *samples,
-                const struct rays *rays, const struct lights *lights, const int32_t *group_of_light, int n_groups,
-                const uint8_t *hold_out, const struct joint_settings *set)
+                const struct rays *rays, const struct lights *lights, int n_groups, const uint8_t *hold_out,
+                const struct joint_settings *set)
 {
     struct stage1 s = { 0 };
+    int32_t *group_of_light = malloc((size_t)lights->n * sizeof(*group_of_light));
     struct photometric p = { .texels = texels, .samples = samples, .model = set->model, .variant = set->variant, .albedo = set->albedo,
                              .group_of_light = group_of_light, .n_groups = n_groups, .texel_step = 1, .n_threads = set->n_threads };
     memset(out, 0, sizeof(*out));
     uint8_t *fit = calloc((size_t)samples->n_views + 1, 1), *held = calloc((size_t)samples->n_views + 1, 1);
     int64_t *per_view = calloc((size_t)samples->n_views + 1, sizeof(*per_view));
     out->inverse_distance_std = calloc((size_t)n_groups, sizeof(double));
-    int err = fit && held && per_view && out->inverse_distance_std ? 0 : -ENOMEM, n_fit_views = 0, n_held = 0;
+    int err = fit && held && per_view && group_of_light && out->inverse_distance_std ? 0 : -ENOMEM, n_fit_views = 0, n_held = 0;
+    for (int i = 0; !err && i < lights->n; i++)
+        group_of_light[i] = i / (lights->n / n_groups);
     for (int64_t i = 0; !err && i < samples->n; i++)
         per_view[samples->view[i]]++;
     for (int v = 0; !err && v < samples->n_views; v++) {
@@ -726,26 +811,13 @@ int joint_solve(struct joint_result *out, const struct texels *texels, const str
         err = stage1_new(&s, &p, lights, rays, set);
     }
     if (!err && set->method == METHOD_JOINT) {
-        double cost, mirrored_cost;
-        err = sweep(&p, lights, rays, set, &s.base, &cost);
-        struct lights mirrored = *lights;
-        double(*dir)[3] = malloc((size_t)lights->n * sizeof(*dir));
-        struct photometric_state unused = { 0 };
-        if (!err)
-            err = dir ? photometric_state_new(&unused, &p, lights) : -ENOMEM;
-        if (!err) {
-            for (int i = 0; i < lights->n; i++)
-                dir[i][0] = -lights->dir_probe[i][0], dir[i][1] = lights->dir_probe[i][1], dir[i][2] = lights->dir_probe[i][2];
-            mirrored.dir_probe = dir;
-            err = sweep(&p, &mirrored, rays, set, &unused, &mirrored_cost);
-            if (!err && mirrored_cost < .5 * cost)
-                out->doubts |= DOUBT_MIRRORED;
-        }
-        photometric_state_free(&unused);
-        free(dir);
+        err = solve_joint(&s, &p, lights, fit, out);
+    } else if (!err && set->method == METHOD_ALTERNATING) {
+        err = solve_alternating(&s, fit);
+    } else if (!err) {
+        set_distances(&s, 0);
+        err = refine(&s, fit);
     }
-    if (!err)
-        err = set->method == METHOD_ALTERNATING ? solve_alternating(&s, fit) : solve_joint(&s, fit, out);
     struct photometric_error e;
     if (!err)
         err = uncertainty(&s, out);
@@ -774,6 +846,7 @@ int joint_solve(struct joint_result *out, const struct texels *texels, const str
     free(fit);
     free(held);
     free(per_view);
+    free(group_of_light);
     if (err)
         joint_result_free(out);
     return err;

@@ -51,9 +51,9 @@ struct joint_result {
     unsigned doubts;                 // 0: trusted
 };
 
-// lights: from the panorama, with the rough set-up (centre, rotation) in it; group_of_light as in photometric.h. hold_out[n_views]: 1 = never
+// lights: from the panorama, with the rough set-up (centre, rotation) in it; aligned runs of lights / n_groups form a group. hold_out[n_views]: 1 = never
 // fitted, only reported. rays may be NULL (no visibility). Progress through progress.h. 0, -EINVAL (logged), -ENOMEM.
 int joint_solve(struct joint_result *out, const struct texels *texels, const struct samples *samples,
-                const struct rays *rays, const struct lights *lights, const int32_t *group_of_light, int n_groups,
+                const struct rays *rays, const struct lights *lights, int n_groups,
                 const uint8_t *hold_out, const struct joint_settings *settings);
 void joint_result_free(struct joint_result *r);

@@ -720,3 +720,61 @@ int lights_read_json(struct lights *out, const char *path)
     json_free(doc);
     return err;
 }
+
+// ---- the pose of the probe ----------------------------------------------------------------------
+
+// Where R is not a rotation to rounding, the nearest one. -EINVAL: not one even to 1e-4.
+static int make_rotation(double R[9])
+{
+    double off = 0;
+    for (int i = 0; i < 3; i++)
+        for (int j = 0; j < 3; j++)
+            off = fmax(off, fabs(vec3_dot(R + 3 * i, R + 3 * j) - (i == j)));
+    if (!(off <= 1e-4) || !(mat3_det(R) > 0))
+        return -EINVAL;
+    if (off <= 1e-14)
+        return 0;
+    static const double axes[3][3] = {{1, 0, 0}, {0, 1, 0}, {0, 0, 1}};
+    double columns[3][3];
+    struct orientation fit;
+    for (int i = 0; i < 3; i++)
+        mat3_mul_vec(columns[i], R, axes[i]);
+    orientation_fit(&fit, axes, columns, NULL, 3);
+    memcpy(R, fit.rotation, sizeof(fit.rotation));
+    return 0;
+}
+
+int lights_read_pose(struct lights *l, bool *has_centre, const char *path)
+{
+    struct json *doc;
+    double R[9], centre_m[3];
+    int err = json_read(&doc, path);
+    if (err)
+        return err;
+    const bool with_centre = !has_centre || json_get(doc, "centre_m");
+    memcpy(centre_m, l->centre_m, sizeof(centre_m));
+    err = json_require_numbers(doc, "world_from_probe", R, 9, path);
+    if (!err && with_centre)
+        err = json_require_numbers(doc, "centre_m", centre_m, 3, path);
+    json_free(doc);
+    if (err)
+        return err == -ENOENT ? -EINVAL : err; // as in from_json()
+    const double determinant = mat3_det(R);
+    if (make_rotation(R)) {
+        log_error("lights: %s: world_from_probe is not a rotation (determinant %g): expected three "
+                  "orthonormal rows, right-handed",
+                  path, determinant);
+        return -EINVAL;
+    }
+    for (int k = 0; k < 3; k++)
+        if (!(fabs(centre_m[k]) <= length_max_m)) {
+            log_error("lights: %s: centre_m is (%g, %g, %g), more than 1e9 m away; expected metres",
+                      path, centre_m[0], centre_m[1], centre_m[2]);
+            return -EINVAL;
+        }
+    memcpy(l->world_from_probe, R, sizeof(R));
+    memcpy(l->centre_m, centre_m, sizeof(centre_m));
+    if (has_centre)
+        *has_centre = with_centre;
+    return 0;
+}

@@ -13,6 +13,7 @@ static const struct {
     const char *what;
 } commands[] = {
     { "synth", command_synth, "make a synthetic studio D1..D5 with a known answer" },
+    { "solve", command_solve, "find the lights' places, the reflectance and every texel's albedo" },
     { "lights", command_lights, "cut a panorama into N lights" },
     { "visibility", command_visibility, "trace which cameras and lights see which texel" },
     { "render", command_render, "re-render views of a solved (or true) material" },

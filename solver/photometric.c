@@ -10,7 +10,14 @@
 #include <stdlib.h>
 #include <string.h>
 
-enum { N_CHUNKS = 48, MAX_VIEWS_PER_TEXEL = 1024 };
+// The inner loops over columns, for the vectors that the machine has.
+#if defined(__x86_64__) && defined(__OPTIMIZE__) && !defined(__SANITIZE_ADDRESS__) && !defined(__SANITIZE_THREAD__)
+#define VECTOR_CLONES __attribute__((target_clones("avx512f", "avx2", "default"), optimize("O3")))
+#else
+#define VECTOR_CLONES
+#endif
+
+enum { N_CHUNKS = 24, MAX_VIEWS_PER_TEXEL = 1024 };
 static const float most_albedo = 1.5f;
 
 struct photometric_layout photometric_layout_of(int n_views, int n_groups)
@@ -142,6 +149,7 @@ struct job {
     int n_workers;
     bool fit;
     int n_free, *column;          // the compact place of each unknown, -1: not free
+    int run;                      // lights per group when groups are aligned runs of so many and all are free; else 0
     bool tinted;                  // the tint matters: solve the albedo twice
     float (*residual)[3];         // [samples n] for the scale and the robust weights, or NULL
 };
@@ -180,6 +188,10 @@ static int job_new(struct job *j, const struct photometric *p, struct photometri
         j->column[i] = is_free[i] ? j->n_free++ : -1;
     if (!j->column)
         goto fail;
+    j->run = s->lights.n / p->n_groups;
+    for (int i = 0; i < s->lights.n; i++)
+        if (!is_free || p->group_of_light[i] != i / j->run || j->column[j->layout.inverse_distance + i / j->run] < 0)
+            j->run = 0, i = s->lights.n;
     for (int i = 0; j->workers && i < j->n_workers; i++) {
         struct worker *w = &j->workers[i];
         w->seen = malloc(MAX_VIEWS_PER_TEXEL * sizeof(*w->seen));
@@ -382,6 +394,24 @@ static void put(const struct job *j, float *row, int unknown, float value)
         row[j->column[unknown]] += value;
 }
 
+VECTOR_CLONES static void add_runs(float *restrict row, const float *restrict by_light, int n_groups, int run, float scale)
+{
+    if (run == 1) {
+        for (int g = 0; g < n_groups; g++)
+            row[g] += scale * by_light[g];
+    } else if (run == 4) {
+        for (int g = 0; g < n_groups; g++)
+            row[g] += scale * (by_light[4 * g] + by_light[4 * g + 1] + by_light[4 * g + 2] + by_light[4 * g + 3]);
+    } else {
+        for (int g = 0; g < n_groups; g++) {
+            float sum = 0;
+            for (int i = g * run; i < (g + 1) * run; i++)
+                sum += by_light[i];
+            row[g] += scale * sum;
+        }
+    }
+}
+
 // The row of channel c of an observation over the free unknowns, times `scale`.
 static void fill_row(const struct job *j, float *row, int c, int view, float scale, const struct shade_jacobian *d,
                      const struct shade_setup *setup)
@@ -396,12 +426,16 @@ static void fill_row(const struct job *j, float *row, int c, int view, float sca
         put(j, row, l->albedo + i, scale * d->albedo[c][i]);
     }
     put(j, row, l->gain + view, scale * d->L[c]);
+    if (j->run) {
+        add_runs(row + j->column[l->inverse_distance], setup->inverse_distance[c], l->n_groups, j->run, scale);
+        return;
+    }
     for (int i = 0; i < j->lights.n; i++)
         put(j, row, l->inverse_distance + j->p->group_of_light[i], scale * setup->inverse_distance[c][i]);
 }
 
 // Remove from the texel's rows of one channel what a change of its albedo would explain.
-static void project_rows(float *rows, size_t stride, int n, const struct observation *seen, int n_seen, int c,
+VECTOR_CLONES static void project_rows(float *rows, size_t stride, int n, const struct observation *seen, int n_seen, int c,
                          float *explained)
 {
     double own2 = 0;

@@ -1,6 +1,8 @@
 // tests/test_brdf.c - rigsolve brdf: what it prints, what it judges, and how it refuses bad tables.
 //
-// Commands are not in the library, so this includes the command's source.
+// Commands are not in the library, so this includes the command's source and what it stands on.
+#include "solver/commands/arguments.c"
+#include "solver/commands/output.c"
 #include "solver/commands/brdf.c"
 
 #include <setjmp.h>

@@ -5,6 +5,7 @@
 #include "solver/take/log.h"
 #include "solver/vec3.h"
 #include "solver/take/atomic_file.h"
+#include "tests/scratch.h"
 
 #include <dirent.h>
 #include <errno.h>
@@ -22,7 +23,6 @@
 // ---- helpers ------------------------------------------------------------------------------------------------------------
 
 static char logged[2048];
-static char dir[256]; // of this program, removed at the end
 
 static void keep_error(void *arg, enum log_level level, const char *message)
 {
@@ -31,45 +31,19 @@ static void keep_error(void *arg, enum log_level level, const char *message)
         snprintf(logged, sizeof(logged), "%s", message);
 }
 
-static const char *in_dir(const char *name)
-{
-    static char path[512];
-    snprintf(path, sizeof(path), "%s/%s", dir, name);
-    return path;
-}
-
-static void write_file(const char *name, const void *bytes, size_t n)
-{
-    FILE *f = fopen(in_dir(name), "wb");
-    assert_non_null(f);
-    assert_int_equal(fwrite(bytes, 1, n, f), n);
-    fclose(f);
-}
-
-static void remove_files(void)
-{
-    DIR *d = opendir(dir);
-    for (struct dirent *e = readdir(d); e; e = readdir(d))
-        if (e->d_name[0] != '.')
-            unlink(in_dir(e->d_name));
-    closedir(d);
-}
-
 static int set_up(void **state)
 {
     (void)state;
-    const char *base = getenv("TMPDIR");
-    snprintf(dir, sizeof(dir), "%s/studiorig-test-XXXXXX", base ? base : "/tmp");
     log_set_hook(keep_error, NULL);
-    return mkdtemp(dir) ? 0 : -1;
+    return scratch_open();
 }
 
 static int tear_down(void **state)
 {
     (void)state;
     log_set_hook(NULL, NULL);
-    remove_files();
-    return rmdir(dir);
+    scratch_empty();
+    return scratch_close();
 }
 
 static void random_point(double out[3], uint64_t i)
@@ -325,8 +299,9 @@ static void colmap_round_trip_keeps_every_distortion_model(void **state)
     views[0].t_m[0] = 0, views[0].t_m[1] = .5, views[0].t_m[2] = 2;
     for (int binary = 0; binary < 2; binary++) {
         struct cameras back;
-        assert_int_equal((binary ? cameras_write_colmap_binary : cameras_write_colmap_text)(&c, dir), 0);
-        assert_int_equal(cameras_read(&back, dir), 0);
+        assert_int_equal(
+            (binary ? cameras_write_colmap_binary : cameras_write_colmap_text)(&c, scratch_dir), 0);
+        assert_int_equal(cameras_read(&back, scratch_dir), 0);
         assert_int_equal(back.n, c.n);
         for (int i = 0; i < c.n; i++) {
             assert_string_equal(back.view[i].name, views[i].name);
@@ -337,7 +312,7 @@ static void colmap_round_trip_keeps_every_distortion_model(void **state)
         }
         assert_null(cameras_find(&back, "view"));
         cameras_free(&back);
-        remove_files();
+        scratch_empty();
     }
 }
 
@@ -347,14 +322,14 @@ static void what_colmap_cannot_hold_is_refused_by_view(void **state)
     for (int kind = 7; kind < N_KINDS; kind++) {
         struct camera views[2] = { make_view(2, 1), make_view(kind, 2) };
         const struct cameras c = { 2, views };
-        assert_int_equal(cameras_write_colmap_text(&c, dir), -ENOTSUP);
+        assert_int_equal(cameras_write_colmap_text(&c, scratch_dir), -ENOTSUP);
         assert_non_null(strstr(logged, views[1].name));
         views[1].skew = 0;
-        assert_int_equal(cameras_write_colmap_binary(&c, dir), -ENOTSUP);
+        assert_int_equal(cameras_write_colmap_binary(&c, scratch_dir), -ENOTSUP);
         assert_non_null(strstr(logged, kind == 7 ? "k4" : "p3"));
     }
     struct dirent **entries;
-    const int n = scandir(dir, &entries, NULL, NULL); // nothing was written
+    const int n = scandir(scratch_dir, &entries, NULL, NULL); // nothing was written
     assert_int_equal(n, 2);
     for (int i = 0; i < n; i++)
         free(entries[i]);
@@ -493,10 +468,12 @@ static void cut_files_never_give_other_cameras(void **state)
         char *bytes[2] = { NULL, NULL };
         size_t n[2] = { 0, 0 };
         struct cameras whole;
-        assert_int_equal((binary ? cameras_write_colmap_binary : cameras_write_colmap_text)(&c, dir), 0);
+        assert_int_equal(
+            (binary ? cameras_write_colmap_binary : cameras_write_colmap_text)(&c, scratch_dir), 0);
         for (int k = 0; k < 2; k++)
-            assert_int_equal(file_read(&bytes[k], &n[k], in_dir(names[binary][k]), 1 << 20), 0);
-        assert_int_equal(cameras_read(&whole, dir), 0);
+            assert_int_equal(file_read(&bytes[k], &n[k], scratch_path(names[binary][k]), 1 << 20),
+                             0);
+        assert_int_equal(cameras_read(&whole, scratch_dir), 0);
         for (int k = 0; k < 2; k++)
             for (size_t cut = 0; cut < n[k]; cut++) {
                 char *exact = malloc(cut + !cut); // of this very length, so that a read beyond is seen
@@ -521,7 +498,7 @@ static void cut_files_never_give_other_cameras(void **state)
         cameras_free(&whole);
         free(bytes[0]);
         free(bytes[1]);
-        remove_files();
+        scratch_empty();
     }
 }
 
@@ -534,9 +511,9 @@ static void absurd_counts_are_refused_before_memory_is_asked_for(void **state)
     const struct cameras c = { 1, &view };
     char *bytes[2] = { NULL, NULL };
     size_t n[2] = { 0, 0 };
-    assert_int_equal(cameras_write_colmap_binary(&c, dir), 0);
-    assert_int_equal(file_read(&bytes[0], &n[0], in_dir("cameras.bin"), 1 << 20), 0);
-    assert_int_equal(file_read(&bytes[1], &n[1], in_dir("images.bin"), 1 << 20), 0);
+    assert_int_equal(cameras_write_colmap_binary(&c, scratch_dir), 0);
+    assert_int_equal(file_read(&bytes[0], &n[0], scratch_path("cameras.bin"), 1 << 20), 0);
+    assert_int_equal(file_read(&bytes[1], &n[1], scratch_path("images.bin"), 1 << 20), 0);
     for (size_t i = 0; i < sizeof(counts) / sizeof(counts[0]); i++)
         for (int place = 0; place < 3; place++) { // cameras, images, points of the image
             char *copy[2] = { malloc(n[0]), malloc(n[1]) };
@@ -554,7 +531,7 @@ static void absurd_counts_are_refused_before_memory_is_asked_for(void **state)
         }
     free(bytes[0]);
     free(bytes[1]);
-    remove_files();
+    scratch_empty();
 }
 
 static void other_tools_files_are_recognised_and_refused(void **state)
@@ -574,33 +551,33 @@ static void other_tools_files_are_recognised_and_refused(void **state)
     };
     for (size_t i = 0; i < sizeof(cases) / sizeof(cases[0]); i++) {
         struct cameras c;
-        write_file("file", cases[i].text, strlen(cases[i].text));
-        assert_int_equal(cameras_read(&c, in_dir("file")), cases[i].err);
+        scratch_write("file", cases[i].text, strlen(cases[i].text));
+        assert_int_equal(cameras_read(&c, scratch_path("file")), cases[i].err);
         assert_non_null(strstr(logged, cases[i].says));
         assert_non_null(strstr(logged, "COLMAP"));
     }
     struct cameras c;
-    remove_files();
-    assert_int_equal(cameras_read(&c, dir), -EINVAL);
+    scratch_empty();
+    assert_int_equal(cameras_read(&c, scratch_dir), -EINVAL);
     assert_non_null(strstr(logged, "no cameras in this folder"));
-    write_file("IMG_1.xmp", "", 0);
-    assert_int_equal(cameras_read(&c, dir), -ENOTSUP);
+    scratch_write("IMG_1.xmp", "", 0);
+    assert_int_equal(cameras_read(&c, scratch_dir), -ENOTSUP);
     assert_non_null(strstr(logged, "RealityCapture"));
-    assert_int_equal(cameras_read(&c, in_dir("nothing")), -ENOENT);
+    assert_int_equal(cameras_read(&c, scratch_path("nothing")), -ENOENT);
     assert_int_equal(cameras_read(&c, "/dev/zero"), -EINVAL);
     // COLMAP beside them wins; binary wins over text; one file stands for its folder
     const char *images = "1 1 0 0 0 0 0 0 7 text.jpg\n\n";
-    write_file("cameras.txt", CAM, strlen(CAM));
-    write_file("images.txt", images, strlen(images));
-    assert_int_equal(cameras_read(&c, in_dir("images.txt")), 0);
+    scratch_write("cameras.txt", CAM, strlen(CAM));
+    scratch_write("images.txt", images, strlen(images));
+    assert_int_equal(cameras_read(&c, scratch_path("images.txt")), 0);
     assert_string_equal(c.view[0].name, "text");
     cameras_free(&c);
     struct camera view = make_view(0, 0);
-    assert_int_equal(cameras_write_colmap_binary(&(struct cameras){ 1, &view }, dir), 0);
-    assert_int_equal(cameras_read(&c, dir), 0);
+    assert_int_equal(cameras_write_colmap_binary(&(struct cameras){ 1, &view }, scratch_dir), 0);
+    assert_int_equal(cameras_read(&c, scratch_dir), 0);
     assert_string_equal(c.view[0].name, view.name);
     cameras_free(&c);
-    remove_files();
+    scratch_empty();
 }
 
 static void files_of_real_tools_are_read_or_refused(void **state)
@@ -621,8 +598,8 @@ static void files_of_real_tools_are_read_or_refused(void **state)
     assert_int_equal(text.n, 11);
     // The text says 6 digits only (f = 2971.71): it agrees with the binary as far as that goes, and to 1e-6 px once it is written
     // out again from the same numbers.
-    assert_int_equal(cameras_write_colmap_text(&binary, dir), 0);
-    assert_int_equal(cameras_read(&again, dir), 0);
+    assert_int_equal(cameras_write_colmap_text(&binary, scratch_dir), 0);
+    assert_int_equal(cameras_read(&again, scratch_dir), 0);
     double by_hand = 0, most = 0;
     int n_seen = 0;
     for (int i = 0; i < 11; i++) {
@@ -662,7 +639,7 @@ static void files_of_real_tools_are_read_or_refused(void **state)
         assert_non_null(cameras_find(&text, "cam084"));
         cameras_free(&text);
     }
-    remove_files();
+    scratch_empty();
 }
 
 int main(void)

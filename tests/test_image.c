@@ -3,6 +3,7 @@
 #include "solver/take/image.h"
 #include "solver/take/image_formats.h"
 #include "solver/take/log.h"
+#include "tests/scratch.h"
 
 #include <dirent.h>
 #include <errno.h>
@@ -24,17 +25,6 @@
 #include <tiffio.h>
 #include <unistd.h>
 #include <cmocka.h>
-
-static char folder[512];
-
-static const char *in_folder(const char *name)
-{
-    static char paths[4][640];
-    static int next;
-    char *path = paths[next++ & 3];
-    snprintf(path, sizeof(paths[0]), "%s/%s", folder, name);
-    return path;
-}
 
 // ---- what was logged ------------------------------------------------------------------------
 
@@ -105,23 +95,11 @@ static int read_text(struct image *out, const char *text, size_t n)
 static int n_files_in_folder(void)
 {
     int n = 0;
-    DIR *dir = opendir(folder);
+    DIR *dir = opendir(scratch_dir);
     for (struct dirent *e; (e = readdir(dir));)
         n += strcmp(e->d_name, ".") && strcmp(e->d_name, "..");
     closedir(dir);
     return n;
-}
-
-static void empty_folder(void)
-{
-    DIR *dir = opendir(folder);
-    for (struct dirent *e; (e = readdir(dir));)
-        if (strcmp(e->d_name, ".") && strcmp(e->d_name, "..")) {
-            char path[1024];
-            snprintf(path, sizeof(path), "%s/%s", folder, e->d_name);
-            remove(path);
-        }
-    closedir(dir);
 }
 
 static float wild_value(uint32_t i)
@@ -227,7 +205,7 @@ static void exr_comes_back_exactly_as_float_and_to_the_nearest_as_half(void **st
             for (int type = IMAGE_HALF; type <= IMAGE_FLOAT; type++)
                 for (int compression = IMAGE_ZIP; compression <= IMAGE_PIZ; compression++) {
                     struct image image = make_image(sizes[s][0], sizes[s][1], channels[c]), back;
-                    const char *path = in_folder("round.exr");
+                    const char *path = scratch_path("round.exr");
                     assert_int_equal(image_write_exr(&image, path, (enum image_type)type,
                                                      (enum image_compression)compression),
                                      0);
@@ -248,8 +226,8 @@ static void half_never_makes_infinities(void **state)
     struct image image, back;
     assert_int_equal(image_new(&image, 2, 1, 1, NULL), 0);
     image.data[0] = INFINITY, image.data[1] = -INFINITY;
-    assert_int_equal(image_write_exr(&image, in_folder("inf.exr"), IMAGE_HALF, IMAGE_ZIP), 0);
-    assert_int_equal(image_read(&back, in_folder("inf.exr")), 0);
+    assert_int_equal(image_write_exr(&image, scratch_path("inf.exr"), IMAGE_HALF, IMAGE_ZIP), 0);
+    assert_int_equal(image_read(&back, scratch_path("inf.exr")), 0);
     assert_true(back.data[0] == 65504 && back.data[1] == -65504);
     image_free(&image);
     image_free(&back);
@@ -265,8 +243,8 @@ static void colours_come_first_the_others_in_file_order(void **state)
                                             "specular",   "subsurface",
                                             "view.left.N" };
     struct image image = make_image(3, 2, 11), back;
-    assert_int_equal(image_write_exr(&image, in_folder("order.exr"), IMAGE_FLOAT, IMAGE_ZIP), 0);
-    assert_int_equal(image_read(&back, in_folder("order.exr")), 0);
+    assert_int_equal(image_write_exr(&image, scratch_path("order.exr"), IMAGE_FLOAT, IMAGE_ZIP), 0);
+    assert_int_equal(image_read(&back, scratch_path("order.exr")), 0);
     for (int c = 0; c < 11; c++)
         assert_string_equal(back.names[c], expected[c]);
     assert_int_equal(image_channel(&back, "roughness"), 7);
@@ -283,7 +261,7 @@ static void equal_pixels_give_equal_bytes(void **state)
         size_t n[2];
         uint8_t *bytes[2];
         for (int i = 0; i < 2; i++) {
-            const char *path = in_folder(i ? "second name.exr" : "first.exr");
+            const char *path = scratch_path(i ? "second name.exr" : "first.exr");
             assert_int_equal(
                 image_write_exr(&image, path, IMAGE_HALF, (enum image_compression)compression), 0);
             bytes[i] = read_all(path, &n[i]);
@@ -302,10 +280,10 @@ static void two_channels_of_one_name_are_refused(void **state)
     struct image image = make_image(2, 2, 3);
     strcpy(image.names[2], "R");
     listen();
-    assert_int_equal(image_write_exr(&image, in_folder("twice.exr"), IMAGE_HALF, IMAGE_ZIP),
+    assert_int_equal(image_write_exr(&image, scratch_path("twice.exr"), IMAGE_HALF, IMAGE_ZIP),
                      -EINVAL);
     assert_logged("twice.exr", "two channels", "R");
-    assert_int_not_equal(access(in_folder("twice.exr"), F_OK), 0);
+    assert_int_not_equal(access(scratch_path("twice.exr"), F_OK), 0);
     image_free(&image);
 }
 
@@ -315,9 +293,10 @@ static void nan_is_named_by_its_pixel(void **state)
     struct image image = make_image(5, 4, 3);
     image.data[(2 * 5 + 3) * 3 + 1] = NAN; // row 2, column 3, G
     listen();
-    assert_int_equal(image_write_exr(&image, in_folder("nan.exr"), IMAGE_FLOAT, IMAGE_ZIP), -EDOM);
+    assert_int_equal(image_write_exr(&image, scratch_path("nan.exr"), IMAGE_FLOAT, IMAGE_ZIP),
+                     -EDOM);
     assert_logged("nan.exr", "channel G", "column 3, row 2");
-    assert_int_not_equal(access(in_folder("nan.exr"), F_OK), 0);
+    assert_int_not_equal(access(scratch_path("nan.exr"), F_OK), 0);
 
     image.data[(3 * 5 + 4) * 3 + 2] = -INFINITY;
     listen();
@@ -472,15 +451,15 @@ static void scanlines_tiles_and_mip_maps_of_half_float_and_unsigned_are_read(voi
                                  .compression = compressions[i],
                                  .data = box(0, 0, 36, 40),
                                  .display = box(0, 0, 36, 40) };
-        write_foreign_exr(in_folder("lines.exr"), &kind);
-        assert_int_equal(image_read(&image, in_folder("lines.exr")), 0);
+        write_foreign_exr(scratch_path("lines.exr"), &kind);
+        assert_int_equal(image_read(&image, scratch_path("lines.exr")), 0);
         assert_pattern(&image, &kind);
         image_free(&image);
         kind.storage = EXR_STORAGE_TILED, kind.tile_width = 16, kind.tile_height = 8;
         for (int levels = EXR_TILE_ONE_LEVEL; levels <= EXR_TILE_MIPMAP_LEVELS; levels++) {
             kind.levels = (exr_tile_level_mode_t)levels;
-            write_foreign_exr(in_folder("tiles.exr"), &kind);
-            assert_int_equal(image_read(&image, in_folder("tiles.exr")), 0);
+            write_foreign_exr(scratch_path("tiles.exr"), &kind);
+            assert_int_equal(image_read(&image, scratch_path("tiles.exr")), 0);
             assert_pattern(&image, &kind);
             image_free(&image);
         }
@@ -502,8 +481,8 @@ static void the_data_window_is_placed_in_the_display_window(void **state)
                                            .tile_height = 16,
                                            .data = box(3, 2, 37, 38),
                                            .display = displays[i] };
-            write_foreign_exr(in_folder("window.exr"), &kind);
-            assert_int_equal(image_read(&image, in_folder("window.exr")), 0);
+            write_foreign_exr(scratch_path("window.exr"), &kind);
+            assert_int_equal(image_read(&image, scratch_path("window.exr")), 0);
             assert_pattern(&image, &kind);
             image_free(&image);
         }
@@ -529,13 +508,13 @@ static void lossy_compressions_are_refused_by_name(void **state)
     } lossy[] = { { 6, "B44" }, { 7, "B44A" }, { 8, "DWAA" }, { 9, "DWAB" } };
     struct image image = make_image(9, 9, 3), back;
     size_t n;
-    assert_int_equal(image_write_exr(&image, in_folder("z.exr"), IMAGE_HALF, IMAGE_ZIP), 0);
-    uint8_t *bytes = read_all(in_folder("z.exr"), &n);
+    assert_int_equal(image_write_exr(&image, scratch_path("z.exr"), IMAGE_HALF, IMAGE_ZIP), 0);
+    uint8_t *bytes = read_all(scratch_path("z.exr"), &n);
     for (int i = 0; i < 4; i++) {
         *attribute(bytes, n, "compression", "compression") = lossy[i].code;
-        write_all(in_folder("lossy.exr"), bytes, n);
+        write_all(scratch_path("lossy.exr"), bytes, n);
         listen();
-        assert_int_equal(image_read(&back, in_folder("lossy.exr")), -ENOTSUP);
+        assert_int_equal(image_read(&back, scratch_path("lossy.exr")), -ENOTSUP);
         assert_logged("lossy.exr", lossy[i].name, "re-save as ZIP");
         assert_null(back.data);
     }
@@ -566,7 +545,7 @@ static void deep_multi_part_and_subsampled_are_refused_by_name(void **state)
     struct image back;
     exr_context_t context;
     int part;
-    start_odd_exr(&context, in_folder("tmp.exr"));
+    start_odd_exr(&context, scratch_path("tmp.exr"));
     for (int i = 0; i < 2; i++) {
         assert_int_equal(exr_add_part(context, i ? "left" : "right", EXR_STORAGE_SCANLINE, &part),
                          0);
@@ -575,32 +554,32 @@ static void deep_multi_part_and_subsampled_are_refused_by_name(void **state)
         assert_int_equal(
             exr_add_channel(context, part, "Y", EXR_PIXEL_HALF, EXR_PERCEPTUALLY_LINEAR, 1, 1), 0);
     }
-    finish_odd_exr(&context, in_folder("tmp.exr"), in_folder("parts.exr"));
+    finish_odd_exr(&context, scratch_path("tmp.exr"), scratch_path("parts.exr"));
     listen();
-    assert_int_equal(image_read(&back, in_folder("parts.exr")), -ENOTSUP);
+    assert_int_equal(image_read(&back, scratch_path("parts.exr")), -ENOTSUP);
     assert_logged("parts.exr", "2 parts");
 
-    start_odd_exr(&context, in_folder("tmp.exr"));
+    start_odd_exr(&context, scratch_path("tmp.exr"));
     assert_int_equal(exr_add_part(context, "deep", EXR_STORAGE_DEEP_SCANLINE, &part), 0);
     assert_int_equal(exr_initialize_required_attr_simple(context, part, 4, 4, EXR_COMPRESSION_ZIPS),
                      0);
     assert_int_equal(exr_set_version(context, part, 1), 0);
     assert_int_equal(
         exr_add_channel(context, part, "Z", EXR_PIXEL_HALF, EXR_PERCEPTUALLY_LINEAR, 1, 1), 0);
-    finish_odd_exr(&context, in_folder("tmp.exr"), in_folder("deep.exr"));
+    finish_odd_exr(&context, scratch_path("tmp.exr"), scratch_path("deep.exr"));
     listen();
-    assert_int_equal(image_read(&back, in_folder("deep.exr")), -ENOTSUP);
+    assert_int_equal(image_read(&back, scratch_path("deep.exr")), -ENOTSUP);
     assert_logged("deep.exr", "deep", "flatten");
 
-    start_odd_exr(&context, in_folder("tmp.exr"));
+    start_odd_exr(&context, scratch_path("tmp.exr"));
     assert_int_equal(exr_add_part(context, NULL, EXR_STORAGE_SCANLINE, &part), 0);
     assert_int_equal(exr_initialize_required_attr_simple(context, part, 4, 4, EXR_COMPRESSION_ZIP),
                      0);
     assert_int_equal(
         exr_add_channel(context, part, "BY", EXR_PIXEL_HALF, EXR_PERCEPTUALLY_LINEAR, 2, 2), 0);
-    finish_odd_exr(&context, in_folder("tmp.exr"), in_folder("yc.exr"));
+    finish_odd_exr(&context, scratch_path("tmp.exr"), scratch_path("yc.exr"));
     listen();
-    assert_int_equal(image_read(&back, in_folder("yc.exr")), -ENOTSUP);
+    assert_int_equal(image_read(&back, scratch_path("yc.exr")), -ENOTSUP);
     assert_logged("yc.exr", "BY", "subsampled");
 }
 
@@ -614,15 +593,15 @@ static void a_header_that_asks_for_more_than_the_file_can_hold_is_refused(void *
     static const char *const names[] = { "dataWindow", "displayWindow" };
     struct image image = make_image(9, 9, 3), back;
     size_t n;
-    assert_int_equal(image_write_exr(&image, in_folder("z.exr"), IMAGE_HALF, IMAGE_ZIP), 0);
+    assert_int_equal(image_write_exr(&image, scratch_path("z.exr"), IMAGE_HALF, IMAGE_ZIP), 0);
     for (int which = 0; which < 2; which++)
         for (int i = 0; i < 4; i++) {
-            uint8_t *bytes = read_all(in_folder("z.exr"), &n);
+            uint8_t *bytes = read_all(scratch_path("z.exr"), &n);
             memcpy(attribute(bytes, n, names[which], "box2i"), windows[i], 16);
-            write_all(in_folder("huge.exr"), bytes, n);
+            write_all(scratch_path("huge.exr"), bytes, n);
             free(bytes);
             listen();
-            const int err = image_read(&back, in_folder("huge.exr"));
+            const int err = image_read(&back, scratch_path("huge.exr"));
             // The library itself refuses sides that overflow, as broken.
             assert_true(err == -EFBIG || (i >= 2 && err == -EINVAL));
             assert_logged("huge.exr");
@@ -638,7 +617,7 @@ static void a_header_that_asks_for_more_than_the_file_can_hold_is_refused(void *
     listen();
     assert_int_equal(read_text(&back, "#?RADIANCE\n\n-Y 0 +X 5\n", 22), -EINVAL);
 
-    TIFF *tiff = TIFFOpen(in_folder("huge.tif"), "w");
+    TIFF *tiff = TIFFOpen(scratch_path("huge.tif"), "w");
     TIFFSetField(tiff, TIFFTAG_IMAGEWIDTH, 60000);
     TIFFSetField(tiff, TIFFTAG_IMAGELENGTH, 4000);
     TIFFSetField(tiff, TIFFTAG_BITSPERSAMPLE, 16);
@@ -649,7 +628,7 @@ static void a_header_that_asks_for_more_than_the_file_can_hold_is_refused(void *
     TIFFWriteRawStrip(tiff, 0, (void *)(uintptr_t)row, sizeof(row));
     TIFFClose(tiff);
     listen();
-    assert_int_equal(image_read(&back, in_folder("huge.tif")), -EFBIG);
+    assert_int_equal(image_read(&back, scratch_path("huge.tif")), -EFBIG);
     assert_logged("huge.tif", "60000", "4000");
 }
 
@@ -658,14 +637,14 @@ static void a_large_black_picture_is_not_taken_for_an_attack(void **state)
     (void)state;
     struct image image, back;
     assert_int_equal(image_new(&image, 7000, 6400, 1, NULL), 0); // 85 MiB of halves in 100 kB
-    assert_int_equal(image_write_exr(&image, in_folder("black.exr"), IMAGE_HALF, IMAGE_ZIP), 0);
-    assert_int_equal(image_read(&back, in_folder("black.exr")), 0);
+    assert_int_equal(image_write_exr(&image, scratch_path("black.exr"), IMAGE_HALF, IMAGE_ZIP), 0);
+    assert_int_equal(image_read(&back, scratch_path("black.exr")), 0);
     assert_int_equal(back.width, 7000);
     image_free(&back);
     image_free(&image);
     assert_int_equal(image_new(&image, 6000, 4000, 1, NULL), 0);
-    assert_int_equal(image_write_png_srgb(&image, in_folder("black.png"), 0), 0);
-    assert_int_equal(image_read(&back, in_folder("black.png")), 0);
+    assert_int_equal(image_write_png_srgb(&image, scratch_path("black.png"), 0), 0);
+    assert_int_equal(image_read(&back, scratch_path("black.png")), 0);
     image_free(&back);
     image_free(&image);
 }
@@ -874,8 +853,8 @@ static void tiff_of_every_layout_is_read(void **state)
                                         i / 18 % 2 ? PLANARCONFIG_SEPARATE : PLANARCONFIG_CONTIG,
                                         compressions[i / 36 % 4],
                                         modes[i / 144] };
-        write_tiff(in_folder("t.tif"), &kind, 37, 41);
-        assert_int_equal(image_read(&image, in_folder("t.tif")), 0);
+        write_tiff(scratch_path("t.tif"), &kind, 37, 41);
+        assert_int_equal(image_read(&image, scratch_path("t.tif")), 0);
         assert_int_equal(image.width, 37);
         assert_int_equal(image.height, 41);
         assert_int_equal(image.n_channels, kind.n_samples);
@@ -922,10 +901,10 @@ static void tiff_of_another_kind_is_refused_by_name(void **state)
     };
     struct image image;
     for (size_t i = 0; i < sizeof(cases) / sizeof(cases[0]); i++) {
-        set_tags(in_folder("odd.tif"), cases[i].photometric, cases[i].n_samples, cases[i].bits,
+        set_tags(scratch_path("odd.tif"), cases[i].photometric, cases[i].n_samples, cases[i].bits,
                  cases[i].format);
         listen();
-        assert_int_equal(image_read(&image, in_folder("odd.tif")), -ENOTSUP);
+        assert_int_equal(image_read(&image, scratch_path("odd.tif")), -ENOTSUP);
         assert_logged("odd.tif", cases[i].word);
     }
 }
@@ -943,8 +922,8 @@ static void png_comes_back_as_value_over_max(void **state)
         pixels[i] = (uint8_t)(i * 37);
     for (int k = 0; k < 3; k++) {
         const int n = channels[k];
-        assert_int_equal(image_write_png(in_folder("p.png"), 13, 9, n, pixels), 0);
-        assert_int_equal(image_read(&image, in_folder("p.png")), 0);
+        assert_int_equal(image_write_png(scratch_path("p.png"), 13, 9, n, pixels), 0);
+        assert_int_equal(image_read(&image, scratch_path("p.png")), 0);
         assert_int_equal(image.n_channels, n);
         assert_string_equal(image.names[0], first[k]);
         for (int i = 0; i < 13 * 9 * n; i++)
@@ -952,7 +931,7 @@ static void png_comes_back_as_value_over_max(void **state)
         image_free(&image);
     }
     listen();
-    assert_int_equal(image_write_png(in_folder("two.png"), 13, 9, 2, pixels), -EINVAL);
+    assert_int_equal(image_write_png(scratch_path("two.png"), 13, 9, 2, pixels), -EINVAL);
     assert_logged("two.png", "2 channels");
 }
 
@@ -985,24 +964,24 @@ static void png_of_sixteen_bits_one_bit_and_palette_is_read(void **state)
     static const uint8_t deep[] = { 0, 1, 255, 255, 18, 52, 128, 0, 0, 0, 1, 0 },
                          bits[] = { 0xa0, 0x40 };
     struct image image;
-    write_foreign_png(in_folder("16.png"), PNG_COLOR_TYPE_RGB, 16, deep, 6, 2, 1);
-    assert_int_equal(image_read(&image, in_folder("16.png")), 0);
+    write_foreign_png(scratch_path("16.png"), PNG_COLOR_TYPE_RGB, 16, deep, 6, 2, 1);
+    assert_int_equal(image_read(&image, scratch_path("16.png")), 0);
     assert_true(image.data[0] == 1.f / 65535 && image.data[1] == 1 &&
                 image.data[2] == 0x1234 / 65535.f && image.data[3] == 0x8000 / 65535.f);
     image_free(&image);
-    write_foreign_png(in_folder("1.png"), PNG_COLOR_TYPE_GRAY, 1, bits, 1, 2, 3);
-    assert_int_equal(image_read(&image, in_folder("1.png")), 0);
+    write_foreign_png(scratch_path("1.png"), PNG_COLOR_TYPE_GRAY, 1, bits, 1, 2, 3);
+    assert_int_equal(image_read(&image, scratch_path("1.png")), 0);
     const float expected[] = { 1, 0, 1, 0, 1, 0 };
     assert_memory_equal(image.data, expected, sizeof(expected));
     image_free(&image);
-    write_foreign_png(in_folder("palette.png"), PNG_COLOR_TYPE_PALETTE, 1, bits, 1, 2, 3);
-    assert_int_equal(image_read(&image, in_folder("palette.png")), 0);
+    write_foreign_png(scratch_path("palette.png"), PNG_COLOR_TYPE_PALETTE, 1, bits, 1, 2, 3);
+    assert_int_equal(image_read(&image, scratch_path("palette.png")), 0);
     assert_int_equal(image.n_channels, 3);
     assert_true(image.data[0] == 1 && image.data[1] == 0 && image.data[2] == .2f &&
                 image.data[3] == 10.f / 255);
     image_free(&image);
-    write_foreign_png(in_folder("ga.png"), PNG_COLOR_TYPE_GRAY_ALPHA, 8, deep, 6, 2, 3);
-    assert_int_equal(image_read(&image, in_folder("ga.png")), 0);
+    write_foreign_png(scratch_path("ga.png"), PNG_COLOR_TYPE_GRAY_ALPHA, 8, deep, 6, 2, 3);
+    assert_int_equal(image_read(&image, scratch_path("ga.png")), 0);
     assert_int_equal(image.n_channels, 2);
     assert_string_equal(image.names[1], "A");
     assert_true(image.data[1] == 1.f / 255);
@@ -1020,16 +999,16 @@ static void tone_mapped_png_follows_the_srgb_curve(void **state)
     for (int i = 0; i < 8; i++)
         image.data[4 * i] = linear[i], image.data[4 * i + 1] = linear[i] / 4,
                        image.data[4 * i + 2] = NAN;
-    assert_int_equal(image_write_png_srgb(&image, in_folder("s.png"), 0), 0);
-    assert_int_equal(image_read(&back, in_folder("s.png")), 0);
+    assert_int_equal(image_write_png_srgb(&image, scratch_path("s.png"), 0), 0);
+    assert_int_equal(image_read(&back, scratch_path("s.png")), 0);
     assert_int_equal(back.n_channels, 3);
     for (int i = 0; i < 8; i++) {
         assert_int_equal(lroundf(back.data[3 * i] * 255), bytes[i]);
         assert_true(back.data[3 * i + 2] == 0); // NaN
     }
     image_free(&back);
-    assert_int_equal(image_write_png_srgb(&image, in_folder("s.png"), 2), 0);
-    assert_int_equal(image_read(&back, in_folder("s.png")), 0);
+    assert_int_equal(image_write_png_srgb(&image, scratch_path("s.png"), 2), 0);
+    assert_int_equal(image_read(&back, scratch_path("s.png")), 0);
     for (int i = 0; i < 8; i++)
         assert_int_equal(lroundf(back.data[3 * i + 1] * 255), bytes[i]); // two stops up
     image_free(&back);
@@ -1042,7 +1021,7 @@ static int make_sample(const char *kind, uint8_t **bytes, size_t *n)
 {
     char name[64];
     snprintf(name, sizeof(name), "sample-%s", kind);
-    const char *path = in_folder(name);
+    const char *path = scratch_path(name);
     struct image image = make_image(13, 11, 3);
     for (int i = 0; i < 13 * 11 * 3; i++) // smooth enough for the compressors to do something
         image.data[i] = (float)(i / 9) / 64;
@@ -1188,14 +1167,14 @@ static void what_is_no_picture_is_named(void **state)
     (void)state;
     struct image image;
     listen();
-    assert_int_equal(image_read(&image, in_folder("missing.exr")), -ENOENT);
+    assert_int_equal(image_read(&image, scratch_path("missing.exr")), -ENOENT);
     assert_logged("missing.exr", "No such file");
     listen();
-    assert_int_equal(image_read(&image, folder), -EISDIR);
-    assert_logged(folder);
-    write_all(in_folder("empty.exr"), "", 0);
+    assert_int_equal(image_read(&image, scratch_dir), -EISDIR);
+    assert_logged(scratch_dir);
+    write_all(scratch_path("empty.exr"), "", 0);
     listen();
-    assert_int_equal(image_read(&image, in_folder("empty.exr")), -EINVAL);
+    assert_int_equal(image_read(&image, scratch_path("empty.exr")), -EINVAL);
     assert_logged("empty.exr", "empty");
     listen();
     assert_int_equal(read_text(&image, "\xff\xd8\xff\xe0", 4), -EINVAL);
@@ -1229,26 +1208,28 @@ static void a_write_that_fails_leaves_the_old_file_and_nothing_else(void **state
 {
     (void)state;
     struct image image = make_image(64, 64, 3), small = make_image(2, 2, 3), back;
-    empty_folder();
-    assert_int_equal(image_write_exr(&small, in_folder("keep.exr"), IMAGE_FLOAT, IMAGE_ZIP), 0);
-    assert_int_equal(write_on_full_disk(&image, in_folder("keep.exr"), false), 0);
-    assert_int_equal(write_on_full_disk(&image, in_folder("keep.png"), true), 0);
+    scratch_empty();
+    assert_int_equal(image_write_exr(&small, scratch_path("keep.exr"), IMAGE_FLOAT, IMAGE_ZIP), 0);
+    assert_int_equal(write_on_full_disk(&image, scratch_path("keep.exr"), false), 0);
+    assert_int_equal(write_on_full_disk(&image, scratch_path("keep.png"), true), 0);
     assert_int_equal(n_files_in_folder(), 1);
-    assert_int_equal(image_read(&back, in_folder("keep.exr")), 0);
+    assert_int_equal(image_read(&back, scratch_path("keep.exr")), 0);
     assert_same_image(&small, &back);
     image_free(&back);
 
     listen();
     assert_int_equal(
-        image_write_exr(&small, in_folder("no/such/folder.exr"), IMAGE_HALF, IMAGE_ZIP), -ENOENT);
+        image_write_exr(&small, scratch_path("no/such/folder.exr"), IMAGE_HALF, IMAGE_ZIP),
+        -ENOENT);
     assert_logged("no/such/folder.exr", "create its folder");
     listen();
     assert_int_equal(
-        image_write_exr(&small, in_folder("keep.exr/below.exr"), IMAGE_HALF, IMAGE_ZIP), -ENOTDIR);
+        image_write_exr(&small, scratch_path("keep.exr/below.exr"), IMAGE_HALF, IMAGE_ZIP),
+        -ENOTDIR);
     assert_logged("below.exr");
     listen();
-    assert_int_equal(image_write_exr(&small, folder, IMAGE_HALF, IMAGE_ZIP), -EISDIR);
-    assert_logged(folder);
+    assert_int_equal(image_write_exr(&small, scratch_dir, IMAGE_HALF, IMAGE_ZIP), -EISDIR);
+    assert_logged(scratch_dir);
     listen();
     assert_int_equal(image_write_exr(&small, "/dev/null", IMAGE_HALF, IMAGE_ZIP), -EINVAL);
     assert_logged("/dev/null", "device");
@@ -1359,19 +1340,17 @@ static void real_panoramas_and_views_read_with_plausible_light(void **state)
 static int make_folder(void **state)
 {
     (void)state;
-    const char *tmp = getenv("TMPDIR");
-    snprintf(folder, sizeof(folder), "%s/studiorig-test-XXXXXX", tmp ? tmp : "/tmp");
     log_set_hook(keep_line, NULL);
     log_set_level(LOG_SILENT); // thousands of refusals are provoked here: only the hook hears them
     TIFFSetWarningHandler(NULL);
-    return mkdtemp(folder) ? 0 : -1;
+    return scratch_open();
 }
 
 static int remove_folder(void **state)
 {
     (void)state;
-    empty_folder();
-    return rmdir(folder);
+    scratch_empty();
+    return scratch_close();
 }
 
 int main(void)

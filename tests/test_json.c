@@ -2,6 +2,7 @@
 // refused by line.
 #include "solver/take/json.h"
 #include "solver/take/log.h"
+#include "tests/scratch.h"
 
 #include <errno.h>
 #include <locale.h>
@@ -16,7 +17,7 @@
 #include <unistd.h>
 #include <cmocka.h>
 
-static char folder[512], path[600];
+static char path[600];
 static struct {
     int n_errors;
     char last[1024];
@@ -319,12 +320,12 @@ static void files_that_cannot_be_read_or_written_are_named(void **state)
     (void)state;
     struct json *doc;
     char other[700];
-    snprintf(other, sizeof(other), "%s/missing.json", folder);
+    snprintf(other, sizeof(other), "%s/missing.json", scratch_dir);
     assert_int_equal(json_read(&doc, other), -ENOENT);
     assert_logged("missing.json");
-    assert_int_equal(json_read(&doc, folder), -EISDIR);
-    assert_logged(folder);
-    snprintf(other, sizeof(other), "%s/huge.json", folder);
+    assert_int_equal(json_read(&doc, scratch_dir), -EISDIR);
+    assert_logged(scratch_dir);
+    snprintf(other, sizeof(other), "%s/huge.json", scratch_dir);
     FILE *f = fopen(other, "w");
     fclose(f);
     assert_int_equal(truncate(other, ((off_t)256 << 20) + 1), 0); // sparse
@@ -332,7 +333,7 @@ static void files_that_cannot_be_read_or_written_are_named(void **state)
     assert_logged("huge.json");
     remove(other);
     doc = json_object();
-    snprintf(other, sizeof(other), "%s/no/such.json", folder);
+    snprintf(other, sizeof(other), "%s/no/such.json", scratch_dir);
     assert_int_equal(json_write(doc, other), -ENOENT);
     assert_logged("no/such.json");
     assert_int_equal(json_write(NULL, path), -ENOMEM); // a tree that could not even begin
@@ -344,13 +345,11 @@ static void files_that_cannot_be_read_or_written_are_named(void **state)
 static int make_folder(void **state)
 {
     (void)state;
-    const char *tmp = getenv("TMPDIR");
-    snprintf(folder, sizeof(folder), "%s/studiorig-test-XXXXXX", tmp ? tmp : "/tmp");
     log_set_hook(keep_line, NULL);
     log_set_level(LOG_SILENT);
-    if (!mkdtemp(folder))
+    if (scratch_open())
         return -1;
-    snprintf(path, sizeof(path), "%s/doc.json", folder);
+    snprintf(path, sizeof(path), "%s/doc.json", scratch_dir);
     return 0;
 }
 
@@ -358,7 +357,7 @@ static int remove_folder(void **state)
 {
     (void)state;
     remove(path);
-    return rmdir(folder);
+    return scratch_close();
 }
 
 int main(void)

@@ -7,6 +7,7 @@
 #include "solver/random.h"
 #include "solver/take/log.h"
 #include "solver/vec3.h"
+#include "tests/scratch.h"
 
 #include <errno.h>
 #include <setjmp.h>
@@ -478,28 +479,16 @@ static void photographed_studios_keep_their_energy(void **state)
 
 // ---- lights.json --------------------------------------------------------------------------------
 
-static char folder[64]; // of this run, removed at the end
-
 static int make_folder(void **state)
 {
     (void)state;
-    snprintf(folder, sizeof(folder), "/tmp/studiorig-test-XXXXXX");
-    return mkdtemp(folder) ? 0 : -1;
+    return scratch_open();
 }
 
 static int remove_folder(void **state)
 {
     (void)state;
-    return rmdir(folder); // fails if a test or a writer left something behind
-}
-
-static const char *in_folder(const char *name)
-{
-    static char path[2][128];
-    static int turn;
-    turn = !turn;
-    snprintf(path[turn], sizeof(path[turn]), "%s/%s", folder, name);
-    return path[turn];
+    return scratch_close();
 }
 
 // A set-up anywhere in a hall. What of its lights: 0 all have distances, 1 every third, 2 none,
@@ -574,7 +563,7 @@ static void compare_set_ups(struct worst *w, const struct lights *a, const struc
 static void through_files(struct worst *w, const struct lights *l)
 {
     struct lights back, third;
-    const char *path = in_folder("lights.json");
+    const char *path = scratch_path("lights.json");
     assert_int_equal(lights_write_json(l, path), 0);
     assert_int_equal(lights_read_json(&back, path), 0);
     assert_int_equal(lights_write_json(&back, path), 0);
@@ -642,7 +631,7 @@ static void lights_far_away_do_not_move_the_centre(void **state)
     struct lights l = random_set_up(64, 0, 2000), back;
     for (int i = 32; i < 64; i++)
         l.inverse_distance[i] = (const double[]){1e-6, 1e-14, 1e-17, 1e-300}[i % 4];
-    const char *path = in_folder("far.json");
+    const char *path = scratch_path("far.json");
     assert_int_equal(lights_write_json(&l, path), 0);
     assert_int_equal(lights_read_json(&back, path), 0);
     unlink(path);
@@ -659,7 +648,7 @@ static void the_file_is_a_list_that_says_where_lights_are_in_the_world(void **st
     (void)state;
     struct lights l = near_lights(8), plain;
     struct json *doc;
-    const char *path = in_folder("list.json");
+    const char *path = scratch_path("list.json");
     assert_int_equal(lights_write_json(&l, path), 0);
     assert_int_equal(json_read(&doc, path), 0);
     assert_int_equal(json_length(doc, ""), 8);
@@ -855,7 +844,7 @@ static void wrong_lights_are_refused_by_name(void **state)
             fail_msg("broken %zu: said \"%s\"", i, last_error);
     }
     log_set_hook(NULL, NULL);
-    assert_int_equal(lights_read_json(&l, in_folder("not-there.json")), -ENOENT);
+    assert_int_equal(lights_read_json(&l, scratch_path("not-there.json")), -ENOENT);
 }
 
 static void more_lights_than_the_limit_are_refused(void **state)
@@ -895,6 +884,95 @@ static void what_a_hand_may_write_is_read(void **state)
     assert_int_equal(parse(&l, X_Y_Z "},{" TO("[0,-1,0]", "[0,-1,0]")), 0); // not all say it
     assert_true(fabs(l.world_from_probe[0] - 1) < 1e-15 && vec3_norm(l.centre_m) < 1e-15);
     lights_free(&l);
+}
+
+// ---- the pose of the probe ----------------------------------------------------------------------
+
+#define CENTRE ", \"centre_m\": [1, 2, 3]"
+
+static int read_pose(struct lights *l, bool *has_centre, const char *rows, const char *rest)
+{
+    const char *path = scratch_path("pose.json");
+    FILE *f = fopen(path, "w");
+    assert_non_null(f);
+    fprintf(f, "{\"note\": \"by hand\", \"world_from_probe\": %s%s}\n", rows, rest);
+    assert_int_equal(fclose(f), 0);
+    log_set_hook(remember, NULL);
+    *last_error = '\0';
+    const int err = lights_read_pose(l, has_centre, path);
+    log_set_hook(NULL, NULL);
+    unlink(path);
+    return err;
+}
+
+static void a_pose_is_the_nearest_rotation_and_an_exact_one_keeps_its_bits(void **state)
+{
+    (void)state;
+    const double w[3] = {.4, -1.1, .7};
+    double exact[9];
+    char rows[512];
+    bool has_centre = false;
+    struct lights l;
+    assert_int_equal(lights_new(&l, 1), 0);
+    mat3_from_rotation_vector(exact, w);
+    for (int decimals = 5; decimals <= 17; decimals += 12) {
+        int n = 0;
+        for (int i = 0; i < 9; i++)
+            n += snprintf(rows + n, sizeof(rows) - (size_t)n, "%s%.*f", i ? "," : "[", decimals,
+                          exact[i]);
+        snprintf(rows + n, sizeof(rows) - (size_t)n, "]");
+        assert_int_equal(read_pose(&l, &has_centre, rows, CENTRE), 0);
+        assert_true(has_centre && l.centre_m[0] == 1 && l.centre_m[2] == 3);
+        for (int i = 0; i < 9; i++) {
+            const double *R = l.world_from_probe;
+            assert_near(R[i], exact[i], decimals == 5 ? 2e-5 : 0);
+            assert_near(vec3_dot(R + 3 * (i / 3), R + 3 * (i % 3)), i % 4 == 0, 1e-15);
+        }
+    }
+    lights_free(&l);
+}
+
+static void a_pose_without_a_centre_leaves_it_where_it_may(void **state)
+{
+    (void)state;
+    struct lights l;
+    bool has_centre = true;
+    assert_int_equal(lights_new(&l, 1), 0);
+    l.centre_m[1] = 7;
+    assert_int_equal(read_pose(&l, &has_centre, "[[0,0,1],[1,0,0],[0,1,0]]", ""), 0);
+    assert_true(!has_centre && l.centre_m[1] == 7 && l.world_from_probe[2] == 1);
+    assert_int_equal(read_pose(&l, NULL, "[[1,0,0],[0,1,0],[0,0,1]]", ""), -EINVAL);
+    assert_non_null(strstr(last_error, "centre_m"));
+    assert_true(l.world_from_probe[2] == 1); // as it was
+    lights_free(&l);
+}
+
+static void a_pose_that_is_no_rotation_is_refused_and_changes_nothing(void **state)
+{
+    (void)state;
+    static const struct {
+        const char *rows, *rest, *says;
+    } cases[] = {
+        {"[[1,0,0],[0,1,0],[0,0,-1]]", CENTRE, "determinant -1"},
+        {"[[1,0,0],[0,1,0],[0,0,1.001]]", CENTRE, "not a rotation"},
+        {"[[1,0,0],[0,1,0],[0,0.001,1]]", CENTRE, "not a rotation"},
+        {"[[0,0,0],[0,0,0],[0,0,0]]", CENTRE, "not a rotation"},
+        {"[[1e300,0,0],[0,1e300,0],[0,0,1e300]]", CENTRE, "not a rotation"},
+        {"[[1,0,0],[0,1,0]]", CENTRE, "world_from_probe"},
+        {"[[1,0,0],[0,1,0],[0,0,1]]", ", \"centre_m\": [0, 0]", "centre_m"},
+        {"[[1,0,0],[0,1,0],[0,0,1]]", ", \"centre_m\": [0, 2e9, 0]", "1e9"},
+    };
+    for (int i = 0; i < (int)(sizeof(cases) / sizeof(cases[0])); i++) {
+        struct lights l;
+        bool has_centre;
+        assert_int_equal(lights_new(&l, 1), 0);
+        l.centre_m[2] = 5;
+        assert_int_equal(read_pose(&l, &has_centre, cases[i].rows, cases[i].rest), -EINVAL);
+        if (!strstr(last_error, cases[i].says) || !strstr(last_error, "pose.json"))
+            fail_msg("case %d: '%s' does not name '%s'", i, last_error, cases[i].says);
+        assert_true(l.centre_m[2] == 5 && l.world_from_probe[4] == 1 && l.centre_m[1] == 0);
+        lights_free(&l);
+    }
 }
 
 // ---- the path-traced studios --------------------------------------------------------------------
@@ -1254,6 +1332,9 @@ int main(void)
         cmocka_unit_test(wrong_lights_are_refused_by_name),
         cmocka_unit_test(more_lights_than_the_limit_are_refused),
         cmocka_unit_test(what_a_hand_may_write_is_read),
+        cmocka_unit_test(a_pose_is_the_nearest_rotation_and_an_exact_one_keeps_its_bits),
+        cmocka_unit_test(a_pose_without_a_centre_leaves_it_where_it_may),
+        cmocka_unit_test(a_pose_that_is_no_rotation_is_refused_and_changes_nothing),
         cmocka_unit_test(panels_of_the_studios_are_found_by_the_cut),
         cmocka_unit_test(the_white_patch_is_predicted_from_the_panorama_at_its_place),
     };

@@ -3,8 +3,8 @@
 #include "solver/take/log.h"
 #include "solver/vec3.h"
 #include "solver/take/atomic_file.h"
+#include "tests/scratch.h"
 
-#include <dirent.h>
 #include <errno.h>
 #include <locale.h>
 #include <setjmp.h>
@@ -20,7 +20,6 @@
 // ---- helpers ------------------------------------------------------------------------------------------------------------
 
 static char errors[2048], warnings[8192];
-static char dir[256]; // of this program, removed at the end
 
 static void keep_lines(void *arg, enum log_level level, const char *message)
 {
@@ -31,47 +30,26 @@ static void keep_lines(void *arg, enum log_level level, const char *message)
         snprintf(warnings + strlen(warnings), sizeof(warnings) - strlen(warnings), "%s\n", message);
 }
 
-static const char *in_dir(const char *name)
-{
-    static char path[512];
-    snprintf(path, sizeof(path), "%s/%s", dir, name);
-    return path;
-}
-
-static void write_file(const char *name, const void *bytes, size_t n)
-{
-    FILE *f = fopen(in_dir(name), "wb");
-    assert_non_null(f);
-    assert_int_equal(fwrite(bytes, 1, n, f), n);
-    fclose(f);
-}
-
 static int set_up(void **state)
 {
     (void)state;
-    const char *base = getenv("TMPDIR");
-    snprintf(dir, sizeof(dir), "%s/studiorig-test-XXXXXX", base ? base : "/tmp");
     log_set_hook(keep_lines, NULL);
-    return mkdtemp(dir) ? 0 : -1;
+    return scratch_open();
 }
 
 static int tear_down(void **state)
 {
     (void)state;
     log_set_hook(NULL, NULL);
-    DIR *d = opendir(dir);
-    for (struct dirent *e = readdir(d); e; e = readdir(d))
-        if (e->d_name[0] != '.')
-            unlink(in_dir(e->d_name));
-    closedir(d);
-    return rmdir(dir);
+    scratch_empty();
+    return scratch_close();
 }
 
 static int read_bytes(struct mesh *out, struct mesh_check *check, const char *name, const void *bytes, size_t n)
 {
-    write_file(name, bytes, n);
+    scratch_write(name, bytes, n);
     errors[0] = 0;
-    return mesh_read(out, check, in_dir(name));
+    return mesh_read(out, check, scratch_path(name));
 }
 
 static int read_text(struct mesh *out, struct mesh_check *check, const char *name, const char *text)
@@ -217,7 +195,7 @@ static void every_format_gives_the_same_uvs(void **state)
             err = read_bytes(&m, &check, "quad.glb", bytes, make_glb(bytes, GLTF(ONE_NODE, "", "")));
             break;
         case 5: // beside the file, with a blank in its name
-            write_file("the quad.bin", buffer, n_buffer);
+            scratch_write("the quad.bin", buffer, n_buffer);
             err = read_text(&m, &check, "quad.gltf", GLTF(ONE_NODE, "\"uri\":\"the%20quad.bin\",", ""));
             break;
         case 6: { // in the file
@@ -512,8 +490,8 @@ static void broken_files_are_refused_with_their_place(void **state)
         assert_true(!m.position_m && !m.triangle);
     }
     struct mesh m;
-    assert_int_equal(mesh_read(&m, NULL, in_dir("nothing")), -ENOENT);
-    assert_int_equal(mesh_read(&m, NULL, dir), -EISDIR);
+    assert_int_equal(mesh_read(&m, NULL, scratch_path("nothing")), -ENOENT);
+    assert_int_equal(mesh_read(&m, NULL, scratch_dir), -EISDIR);
     assert_int_equal(mesh_read(&m, NULL, "/dev/zero"), -EINVAL);
 }
 
@@ -610,7 +588,7 @@ static void buffer_cut_short_is_refused(void **state)
     const size_t n = quad_buffer(buffer);
     for (size_t cut = 0; cut <= n; cut++) {
         struct mesh m;
-        write_file("cut.bin", buffer, cut);
+        scratch_write("cut.bin", buffer, cut);
         const int err = read_text(&m, NULL, "cut.gltf", GLTF(ONE_NODE, "\"uri\":\"cut.bin\",", ""));
         assert_int_equal(err, cut < n ? -EINVAL : 0);
         assert_int_equal(cut < n, errors[0] != 0);
@@ -653,8 +631,8 @@ static void written_obj_reads_back(void **state)
             cube.position_m[i][c] *= c == 0 ? .1234567f : c == 1 ? 12345.678f : 3.3e-5f;
     if (!setlocale(LC_ALL, "de_DE.UTF-8"))
         setlocale(LC_ALL, "C");
-    assert_int_equal(mesh_write_obj(&cube, in_dir("back.obj")), 0);
-    assert_int_equal(mesh_read(&back, NULL, in_dir("back.obj")), 0);
+    assert_int_equal(mesh_write_obj(&cube, scratch_path("back.obj")), 0);
+    assert_int_equal(mesh_read(&back, NULL, scratch_path("back.obj")), 0);
     setlocale(LC_ALL, "C");
     assert_int_equal(back.n_vertices, cube.n_vertices);
     assert_int_equal(back.n_triangles, cube.n_triangles);

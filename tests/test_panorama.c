@@ -3,6 +3,7 @@
 #include "solver/random.h"
 #include "solver/take/log.h"
 #include "solver/vec3.h"
+#include "tests/scratch.h"
 
 #include <errno.h>
 #include <math.h>
@@ -152,26 +153,16 @@ static void a_lone_pixel_lights_by_its_cosine_and_not_from_behind(void **state)
 
 // ---- reading ------------------------------------------------------------------------------------
 
-static char folder[64];
-
 static int make_folder(void **state)
 {
     (void)state;
-    snprintf(folder, sizeof(folder), "/tmp/studiorig-test-XXXXXX");
-    return mkdtemp(folder) ? 0 : -1;
+    return scratch_open();
 }
 
 static int remove_folder(void **state)
 {
     (void)state;
-    return rmdir(folder);
-}
-
-static const char *file_in_folder(void)
-{
-    static char path[128];
-    snprintf(path, sizeof(path), "%s/p.exr", folder);
-    return path;
+    return scratch_close();
 }
 
 // Read the file as a panorama, then remove it.
@@ -179,9 +170,9 @@ static int read_and_remove(struct panorama *out)
 {
     last_error[0] = last_warning[0] = 0;
     log_set_hook(remember, NULL);
-    const int err = panorama_read(out, file_in_folder());
+    const int err = panorama_read(out, scratch_path("p.exr"));
     log_set_hook(NULL, NULL);
-    unlink(file_in_folder());
+    unlink(scratch_path("p.exr"));
     if (err)
         assert_true(!out->image.data && strstr(last_error, "p.exr"));
     return err;
@@ -189,7 +180,7 @@ static int read_and_remove(struct panorama *out)
 
 static int read_back(struct panorama *out, const struct image *image)
 {
-    assert_int_equal(image_write_exr(image, file_in_folder(), IMAGE_FLOAT, IMAGE_ZIP), 0);
+    assert_int_equal(image_write_exr(image, scratch_path("p.exr"), IMAGE_FLOAT, IMAGE_ZIP), 0);
     return read_and_remove(out);
 }
 
@@ -221,7 +212,7 @@ static int read_back_any_float(struct panorama *out, const struct image *image)
     };
     const uint16_t n_entries = N_ENTRIES, bits_and_format[6] = {32, 32, 32, 3, 3, 3};
     const uint32_t end = 0;
-    FILE *f = fopen(file_in_folder(), "wb");
+    FILE *f = fopen(scratch_path("p.exr"), "wb");
     assert_non_null(f);
     fwrite("II*\0\10\0\0\0", 1, HEAD, f);
     fwrite(&n_entries, 2, 1, f);

@@ -4,6 +4,7 @@
 #include "solver/take/atomic_file.h"
 #include "solver/take/log.h"
 #include "solver/take/progress.h"
+#include "tests/scratch.h"
 
 #include <dirent.h>
 #include <errno.h>
@@ -22,17 +23,6 @@
 #include <sys/wait.h>
 #include <unistd.h>
 #include <cmocka.h>
-
-static char folder[512];
-
-static const char *in_folder(const char *name)
-{
-    static char paths[4][640];
-    static int next;
-    char *path = paths[next++ & 3];
-    snprintf(path, sizeof(paths[0]), "%s/%s", folder, name);
-    return path;
-}
 
 static struct {
     int n[LOG_SILENT];
@@ -103,18 +93,16 @@ static int n_files(const char *dir, const char *with)
 static int fresh_folder(void **state)
 {
     (void)state;
-    const char *tmp = getenv("TMPDIR");
-    snprintf(folder, sizeof(folder), "%s/studiorig-test-XXXXXX", tmp ? tmp : "/tmp");
     log_set_hook(keep_line, NULL);
     log_set_level(LOG_SILENT);
     listen();
-    return mkdtemp(folder) ? 0 : -1;
+    return scratch_open();
 }
 
 static int remove_folder(void **state)
 {
     (void)state;
-    remove_all(folder);
+    remove_all(scratch_dir);
     return 0;
 }
 
@@ -124,16 +112,16 @@ static void the_name_holds_the_old_file_until_commit_and_the_new_one_after(void 
 {
     (void)state;
     struct atomic_file f;
-    const char *path = in_folder("report.json");
+    const char *path = scratch_path("report.json");
     put(path, "old");
     assert_int_equal(atomic_file_open(&f, path), 0);
     fputs("new", f.stream);
     fflush(f.stream);
     assert_holds(path, "old");
-    assert_int_equal(n_files(folder, ".part"), 1);
+    assert_int_equal(n_files(scratch_dir, ".part"), 1);
     assert_int_equal(atomic_file_commit(&f), 0);
     assert_holds(path, "new");
-    assert_int_equal(n_files(folder, ""), 1);
+    assert_int_equal(n_files(scratch_dir, ""), 1);
     assert_null(f.stream);
     atomic_file_abandon(&f); // harmless
 
@@ -149,10 +137,10 @@ static void abandon_leaves_no_trace(void **state)
 {
     (void)state;
     struct atomic_file f;
-    assert_int_equal(atomic_file_open(&f, in_folder("a.txt")), 0);
+    assert_int_equal(atomic_file_open(&f, scratch_path("a.txt")), 0);
     fputs("half", f.stream);
     atomic_file_abandon(&f);
-    assert_int_equal(n_files(folder, ""), 0);
+    assert_int_equal(n_files(scratch_dir, ""), 0);
     struct atomic_file zeroed = { 0 };
     atomic_file_abandon(&zeroed);
 }
@@ -160,7 +148,7 @@ static void abandon_leaves_no_trace(void **state)
 static void a_writer_killed_before_commit_leaves_the_old_file(void **state)
 {
     (void)state;
-    const char *path = in_folder("take.json");
+    const char *path = scratch_path("take.json");
     put(path, "old");
     for (int how = 0; how < 2; how++) {
         int status = 0;
@@ -181,7 +169,7 @@ static void a_writer_killed_before_commit_leaves_the_old_file(void **state)
     }
     // The strays are hidden, and the next writer is not disturbed by them.
     struct atomic_file f;
-    assert_int_equal(n_files(folder, ".part"), 2);
+    assert_int_equal(n_files(scratch_dir, ".part"), 2);
     assert_int_equal(atomic_file_open(&f, path), 0);
     fputs("new", f.stream);
     assert_int_equal(atomic_file_commit(&f), 0);
@@ -192,7 +180,7 @@ static void two_writers_of_one_name_do_not_mix(void **state)
 {
     (void)state;
     struct atomic_file a, b;
-    const char *path = in_folder("both");
+    const char *path = scratch_path("both");
     assert_int_equal(atomic_file_open(&a, path), 0);
     assert_int_equal(atomic_file_open(&b, path), 0);
     fputs("aaaa", a.stream);
@@ -201,14 +189,14 @@ static void two_writers_of_one_name_do_not_mix(void **state)
     assert_holds(path, "aaaa");
     assert_int_equal(atomic_file_commit(&b), 0);
     assert_holds(path, "b");
-    assert_int_equal(n_files(folder, ""), 1);
+    assert_int_equal(n_files(scratch_dir, ""), 1);
 }
 
 static void a_full_device_is_an_error_and_keeps_the_old_file(void **state)
 {
     (void)state;
     struct atomic_file f;
-    const char *path = in_folder("old");
+    const char *path = scratch_path("old");
     put(path, "old");
     assert_int_equal(atomic_file_open(&f, path), 0);
     // The part's descriptor becomes the device that is always full: flushing fails as on a full
@@ -221,15 +209,15 @@ static void a_full_device_is_an_error_and_keeps_the_old_file(void **state)
     assert_int_equal(atomic_file_commit(&f), -ENOSPC);
     assert_logged(1, "free some space");
     assert_holds(path, "old");
-    assert_int_equal(n_files(folder, ""), 1);
+    assert_int_equal(n_files(scratch_dir, ""), 1);
 }
 
 static void an_error_while_writing_is_not_forgotten_at_commit(void **state)
 {
     (void)state;
     struct atomic_file f;
-    put(in_folder("old"), "old");
-    assert_int_equal(atomic_file_open(&f, in_folder("old")), 0);
+    put(scratch_path("old"), "old");
+    assert_int_equal(atomic_file_open(&f, scratch_path("old")), 0);
     const int kept = dup(fileno(f.stream)), full = open("/dev/full", O_RDWR);
     assert_true(kept >= 0 && full >= 0 && dup2(full, fileno(f.stream)) >= 0);
     setvbuf(f.stream, NULL, _IONBF, 0);
@@ -239,7 +227,7 @@ static void an_error_while_writing_is_not_forgotten_at_commit(void **state)
     close(full);
     fputs("new", f.stream);
     assert_true(atomic_file_commit(&f) < 0);
-    assert_holds(in_folder("old"), "old");
+    assert_holds(scratch_path("old"), "old");
 }
 
 static void places_that_cannot_be_written_are_named(void **state)
@@ -253,11 +241,11 @@ static void places_that_cannot_be_written_are_named(void **state)
                   { "dir", -EISDIR },
                   { "dir/", -EISDIR } };
     struct atomic_file f;
-    put(in_folder("file"), "");
-    assert_int_equal(mkdir(in_folder("dir"), 0777), 0);
+    put(scratch_path("file"), "");
+    assert_int_equal(mkdir(scratch_path("dir"), 0777), 0);
     for (int i = 0; i < 4; i++) {
         listen();
-        assert_int_equal(atomic_file_open(&f, in_folder(cases[i].name)), cases[i].err);
+        assert_int_equal(atomic_file_open(&f, scratch_path(cases[i].name)), cases[i].err);
         assert_logged(1, cases[i].name);
         assert_null(f.stream);
         atomic_file_abandon(&f);
@@ -271,17 +259,17 @@ static void places_that_cannot_be_written_are_named(void **state)
     listen();
     assert_int_equal(atomic_file_open(&f, ""), -EISDIR);
     assert_logged(1, "without a name");
-    assert_int_equal(n_files(folder, ""), 2);
+    assert_int_equal(n_files(scratch_dir, ""), 2);
 }
 
 static void commit_by_path_keeps_the_same_promises(void **state)
 {
     (void)state;
-    const char *path = in_folder("model.glb");
+    const char *path = scratch_path("model.glb");
     put(path, "old");
     char *part = atomic_file_part_path(path);
     assert_non_null(part);
-    assert_int_equal(strncmp(part, folder, strlen(folder)), 0);
+    assert_int_equal(strncmp(part, scratch_dir, strlen(scratch_dir)), 0);
     put(part, "new");
     assert_holds(path, "old");
     assert_int_equal(atomic_file_commit_path(part, path), 0);
@@ -290,7 +278,7 @@ static void commit_by_path_keeps_the_same_promises(void **state)
     assert_int_equal(atomic_file_commit_path(part, path), -ENOENT); // nothing was written this time
     assert_logged(1, "model.glb");
     assert_holds(path, "new");
-    assert_int_equal(n_files(folder, ""), 1);
+    assert_int_equal(n_files(scratch_dir, ""), 1);
     free(part);
     part = atomic_file_part_path("bare");
     assert_null(strchr(part, '/'));
@@ -301,13 +289,13 @@ static void make_directories_makes_parents_and_minds_files(void **state)
 {
     (void)state;
     struct stat st;
-    assert_int_equal(make_directories(in_folder("a/b//c/")), 0);
-    assert_int_equal(stat(in_folder("a/b/c"), &st), 0);
-    assert_int_equal(make_directories(in_folder("a/b")), 0);
+    assert_int_equal(make_directories(scratch_path("a/b//c/")), 0);
+    assert_int_equal(stat(scratch_path("a/b/c"), &st), 0);
+    assert_int_equal(make_directories(scratch_path("a/b")), 0);
     assert_int_equal(make_directories("/"), 0);
-    put(in_folder("a/file"), "");
+    put(scratch_path("a/file"), "");
     listen();
-    assert_int_equal(make_directories(in_folder("a/file/d")), -ENOTDIR);
+    assert_int_equal(make_directories(scratch_path("a/file/d")), -ENOTDIR);
     assert_logged(1, "a/file");
     listen();
     assert_int_equal(make_directories(""), -ENOENT);
@@ -319,16 +307,16 @@ static void whole_files_are_read_up_to_the_limit(void **state)
     (void)state;
     char *bytes;
     size_t n;
-    put(in_folder("five"), "12345");
-    assert_int_equal(file_read(&bytes, &n, in_folder("five"), 5), 0);
+    put(scratch_path("five"), "12345");
+    assert_int_equal(file_read(&bytes, &n, scratch_path("five"), 5), 0);
     assert_string_equal(bytes, "12345");
     free(bytes);
     listen();
-    assert_int_equal(file_read(&bytes, &n, in_folder("five"), 4), -EFBIG);
+    assert_int_equal(file_read(&bytes, &n, scratch_path("five"), 4), -EFBIG);
     assert_logged(1, "five");
     assert_null(bytes);
-    put(in_folder("none"), "");
-    assert_int_equal(file_read(&bytes, &n, in_folder("none"), 5), 0);
+    put(scratch_path("none"), "");
+    assert_int_equal(file_read(&bytes, &n, scratch_path("none"), 5), 0);
     assert_true(n == 0 && bytes[0] == 0);
     free(bytes);
 
@@ -369,7 +357,7 @@ static void a_new_take_has_its_folders_and_manifest_and_nothing_to_solve(void **
 {
     (void)state;
     struct take *take;
-    const char *dir = in_folder("takes/one");
+    const char *dir = scratch_path("takes/one");
     const char *string;
     assert_int_equal(take_create(dir, "vase \"1\"", "2026-11-22T03:00:00Z", "open"), 0);
     assert_int_equal(take_open(&take, dir), 0);
@@ -406,9 +394,10 @@ static void a_new_take_has_its_folders_and_manifest_and_nothing_to_solve(void **
     listen();
     assert_int_equal(take_create(dir, "again", "2026-11-22T03:00:01Z", "open"), -EEXIST);
     assert_logged(1, "takes/one");
-    assert_int_equal(mkdir(in_folder("empty"), 0777), 0);
+    assert_int_equal(mkdir(scratch_path("empty"), 0777), 0);
     assert_int_equal(
-        take_create(in_folder("empty"), "in an empty folder", "2026-11-22T03:00:00Z", "open"), 0);
+        take_create(scratch_path("empty"), "in an empty folder", "2026-11-22T03:00:00Z", "open"),
+        0);
     take_close(NULL);
 }
 
@@ -419,9 +408,10 @@ static void equal_takes_have_equal_manifests(void **state)
     size_t n[2];
     for (int i = 0; i < 2; i++) {
         assert_int_equal(
-            take_create(in_folder(i ? "b" : "a"), "name", "2026-11-22T03:00:00Z", "open"), 0);
+            take_create(scratch_path(i ? "b" : "a"), "name", "2026-11-22T03:00:00Z", "open"), 0);
         assert_int_equal(
-            file_read(&bytes[i], &n[i], in_folder(i ? "b/take.json" : "a/take.json"), 1 << 20), 0);
+            file_read(&bytes[i], &n[i], scratch_path(i ? "b/take.json" : "a/take.json"), 1 << 20),
+            0);
     }
     assert_int_equal(n[0], n[1]);
     assert_memory_equal(bytes[0], bytes[1], n[0]);
@@ -441,22 +431,22 @@ static void every_piece_is_found_and_views_are_sorted(void **state)
     };
     static const char *const views[] = { "B", "a", "cam.two", "cam002", "cam010" };
     struct take *take;
-    assert_int_equal(make_directories(in_folder("linear")), 0);
-    assert_int_equal(make_directories(in_folder("linear/folder.exr")), 0);
-    assert_int_equal(make_directories(in_folder("geometry/cameras")), 0);
+    assert_int_equal(make_directories(scratch_path("linear")), 0);
+    assert_int_equal(make_directories(scratch_path("linear/folder.exr")), 0);
+    assert_int_equal(make_directories(scratch_path("geometry/cameras")), 0);
     for (size_t i = 0; i < sizeof(files) / sizeof(files[0]); i++)
-        put(in_folder(files[i]), "{}");
-    assert_int_equal(take_open(&take, folder), 0);
+        put(scratch_path(files[i]), "{}");
+    assert_int_equal(take_open(&take, scratch_dir), 0);
     assert_null(take->manifest); // a plain folder is a take as well
     assert_int_equal(take->n_views, 5);
     for (int i = 0; i < 5; i++)
         assert_string_equal(take->view_names[i], views[i]);
-    assert_string_equal(take->view_paths[3], in_folder("linear/cam002.TIF"));
-    assert_string_equal(take->mesh_path, in_folder("geometry/mesh.glb"));
-    assert_string_equal(take->cameras_path, in_folder("geometry/cameras"));
-    assert_string_equal(take->panorama_path, in_folder("panorama.exr"));
-    assert_string_equal(take->start_path, in_folder("start.json"));
-    assert_string_equal(take->linear_dir, in_folder("linear"));
+    assert_string_equal(take->view_paths[3], scratch_path("linear/cam002.TIF"));
+    assert_string_equal(take->mesh_path, scratch_path("geometry/mesh.glb"));
+    assert_string_equal(take->cameras_path, scratch_path("geometry/cameras"));
+    assert_string_equal(take->panorama_path, scratch_path("panorama.exr"));
+    assert_string_equal(take->start_path, scratch_path("start.json"));
+    assert_string_equal(take->linear_dir, scratch_path("linear"));
     assert_int_equal(
         take_require(take, TAKE_MESH | TAKE_CAMERAS | TAKE_PANORAMA | TAKE_VIEWS | TAKE_START), 0);
     assert_int_equal(logged.n[LOG_ERROR] + logged.n[LOG_WARNING], 0);
@@ -467,16 +457,17 @@ static void cameras_may_be_one_file_and_a_second_mesh_is_warned_of(void **state)
 {
     (void)state;
     struct take *take;
-    assert_int_equal(make_directories(in_folder("geometry/cameras")), 0); // empty: the file counts
-    put(in_folder("geometry/cameras.xml"), "");
-    put(in_folder("geometry/mesh.ply"), "");
-    put(in_folder("geometry/mesh.obj"), "");
-    put(in_folder("panorama.hdr"), "");
+    assert_int_equal(make_directories(scratch_path("geometry/cameras")),
+                     0); // empty: the file counts
+    put(scratch_path("geometry/cameras.xml"), "");
+    put(scratch_path("geometry/mesh.ply"), "");
+    put(scratch_path("geometry/mesh.obj"), "");
+    put(scratch_path("panorama.hdr"), "");
     listen();
-    assert_int_equal(take_open(&take, folder), 0);
-    assert_string_equal(take->cameras_path, in_folder("geometry/cameras.xml"));
-    assert_string_equal(take->mesh_path, in_folder("geometry/mesh.obj"));
-    assert_string_equal(take->panorama_path, in_folder("panorama.hdr"));
+    assert_int_equal(take_open(&take, scratch_dir), 0);
+    assert_string_equal(take->cameras_path, scratch_path("geometry/cameras.xml"));
+    assert_string_equal(take->mesh_path, scratch_path("geometry/mesh.obj"));
+    assert_string_equal(take->panorama_path, scratch_path("panorama.hdr"));
     assert_null(take->linear_dir);
     assert_int_equal(logged.n[LOG_WARNING], 1);
     assert_non_null(strstr(logged.text, "mesh.ply is not"));
@@ -487,12 +478,12 @@ static void two_views_of_one_stem_are_refused(void **state)
 {
     (void)state;
     struct take *take;
-    assert_int_equal(make_directories(in_folder("linear")), 0);
-    put(in_folder("linear/cam1.exr"), "");
-    put(in_folder("linear/cam1-b.exr"), "");
-    put(in_folder("linear/cam1.tif"), "");
+    assert_int_equal(make_directories(scratch_path("linear")), 0);
+    put(scratch_path("linear/cam1.exr"), "");
+    put(scratch_path("linear/cam1-b.exr"), "");
+    put(scratch_path("linear/cam1.tif"), "");
     listen();
-    assert_int_equal(take_open(&take, folder), -EINVAL);
+    assert_int_equal(take_open(&take, scratch_dir), -EINVAL);
     assert_logged(1, "cam1.exr");
     assert_logged(1, "cam1.tif");
     assert_null(take);
@@ -502,16 +493,16 @@ static void a_broken_manifest_and_a_missing_folder_are_named(void **state)
 {
     (void)state;
     struct take *take;
-    put(in_folder("take.json"), "{\n\"name\": }");
+    put(scratch_path("take.json"), "{\n\"name\": }");
     listen();
-    assert_int_equal(take_open(&take, folder), -EINVAL);
+    assert_int_equal(take_open(&take, scratch_dir), -EINVAL);
     assert_logged(1, "take.json:2:");
     assert_null(take);
     listen();
-    assert_int_equal(take_open(&take, in_folder("nowhere")), -ENOENT);
+    assert_int_equal(take_open(&take, scratch_path("nowhere")), -ENOENT);
     assert_logged(1, "nowhere");
     listen();
-    assert_int_equal(take_open(&take, in_folder("take.json")), -ENOTDIR);
+    assert_int_equal(take_open(&take, scratch_path("take.json")), -ENOTDIR);
     assert_logged(1, "take.json");
 }
 

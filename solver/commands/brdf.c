@@ -2,7 +2,9 @@
 //
 // The reference prints what disney.c gives. A float kernel is shown one light of irradiance 1, in the surface's own frame (so that
 // directions are rounded once), and its L = f <n,l> is divided by <n,l>.
+#include "solver/commands/arguments.h"
 #include "solver/commands/commands.h"
+#include "solver/commands/output.h"
 #include "solver/csv.h"
 #include "solver/disney.h"
 #include "solver/kernels/kernels.h"
@@ -48,20 +50,14 @@ static const char doc[] =
 
 static error_t parse_option(int key, char *arg, struct argp_state *state)
 {
+    static const char *const kernels[] = { "reference", "portable", "avx2", "avx512" }, *const variants[] = { "2017", "2012" };
     struct settings *s = state->input;
     switch (key) {
     case 'k':
-        if (strcmp(arg, "reference") && strcmp(arg, "portable") && strcmp(arg, "avx2") && strcmp(arg, "avx512"))
-            argp_error(state, "--kernel '%s': expected reference, portable, avx2 or avx512", arg);
-        s->kernel = arg;
+        s->kernel = kernels[argument_choice(state, "--kernel", arg, kernels, 4)];
         return 0;
     case 'v':
-        if (!strcmp(arg, "2017"))
-            s->variant = DISNEY_2017;
-        else if (!strcmp(arg, "2012"))
-            s->variant = DISNEY_2012;
-        else
-            argp_error(state, "--variant '%s': expected 2017 or 2012", arg);
+        s->variant = argument_choice(state, "--variant", arg, variants, 2) ? DISNEY_2012 : DISNEY_2017;
         return 0;
     case 'o':
         s->out = arg;
@@ -345,12 +341,8 @@ static int report(const struct errors *e, const struct settings *s, char names[N
         json_set_int(doc_json, "worst_line", e->worst_line);
         json_set_string(doc_json, "worst_column", e->worst_line ? names[e->worst_value] : "");
         json_set_bool(doc_json, "within_bounds", good);
-        char *text = json_text(doc_json);
-        json_free(doc_json);
-        if (!text)
+        if (output_json("brdf", doc_json))
             return EXIT_FAILED;
-        puts(text);
-        free(text);
     } else {
         printf("%s, %s: %ld values in %ld cases, relative to %s:\n", s->kernel, disney_variant_name(s->variant),
                e->n_compared, e->n_cases, of);

@@ -8,6 +8,7 @@ enum { EXIT_DONE = 0, EXIT_FAILED = 1, EXIT_USAGE = 2, EXIT_NOT_TRUSTED = 3 };
 int command_brdf(int argc, char **argv);
 int command_lights(int argc, char **argv);
 int command_visibility(int argc, char **argv);
+int command_solve(int argc, char **argv);
 int command_synth(int argc, char **argv);
 int command_render(int argc, char **argv);
 int command_compare(int argc, char **argv);

@@ -1,6 +1,7 @@
 // solver/commands/compare.c - rigsolve compare: how far two pictures, or two folders of pictures,
 // are apart.
 #include "solver/commands/commands.h"
+#include "solver/commands/output.h"
 #include "solver/compare.h"
 #include "solver/take/json.h"
 #include "solver/take/log.h"
@@ -310,18 +311,9 @@ int command_compare(int argc, char **argv)
         if (!err && !args.json)
             print_comparison("picture", &c);
     }
-    if (!err && args.json) {
-        char *text = json_text(doc);
-        if (text)
-            puts(text);
-        else
-            err = -ENOMEM;
-        free(text);
-    }
-    if (!err && fflush(stdout)) {
-        err = -errno;
-        log_error("compare: cannot print: %s", strerror(-err));
-    }
-    json_free(doc);
+    if (err || !args.json)
+        json_free(doc);
+    if (!err)
+        err = args.json ? output_json("compare", doc) : output_flush("compare");
     return err ? EXIT_FAILED : EXIT_DONE;
 }

@@ -1,6 +1,8 @@
 // solver/commands/lights.c - rigsolve lights: cut a panorama into N lights, say what came of it,
 // draw it.
+#include "solver/commands/arguments.h"
 #include "solver/commands/commands.h"
+#include "solver/commands/output.h"
 #include "solver/lights.h"
 #include "solver/take/log.h"
 #include "solver/vec3.h"
@@ -37,15 +39,10 @@ static const struct argp_option options[] = {
 static error_t parse(int key, char *text, struct argp_state *state)
 {
     struct arguments *a = state->input;
-    char *end = text;
     switch (key) {
-    case 'n': {
-        const long n = strtol(text, &end, 10);
-        if (end == text || *end || n < 1 || n > LIGHTS_MAX || (n & (n - 1)))
-            argp_error(state, "-n %s: expected a power of two from 1 to %d", text, LIGHTS_MAX);
-        a->n = (int)n;
+    case 'n':
+        a->n = argument_power_of_two(state, "-n", text, LIGHTS_MAX);
         return 0;
-    }
     case 'o':
         a->output = text;
         return 0;
@@ -53,9 +50,7 @@ static error_t parse(int key, char *text, struct argp_state *state)
         a->overlay = text;
         return 0;
     case OPTION_EXPOSURE:
-        a->exposure_ev = strtod(text, &end);
-        if (end == text || *end || !(fabs(a->exposure_ev) <= 40))
-            argp_error(state, "--exposure %s: expected stops from -40 to 40", text);
+        a->exposure_ev = argument_number(state, "--exposure", text, "stops", -40, 40);
         return 0;
     case OPTION_JSON:
         a->json = true;
@@ -166,7 +161,7 @@ static void summarise(struct summary *s, const struct panorama *p, const struct 
     s->mean = luminance(s->before[0], s->before[1], s->before[2]) / (4 * M_PI);
 }
 
-static void print_text(const struct summary *s, const struct arguments *a, const struct lights *l)
+static int print_text(const struct summary *s, const struct arguments *a, const struct lights *l)
 {
     printf("panorama   %s: %dx%d px, brightest pixel %.4g = %.3g x the mean\n", a->panorama,
            l->panorama_width_px, l->panorama_height_px, s->peak, s->peak / s->mean);
@@ -183,6 +178,7 @@ static void print_text(const struct summary *s, const struct arguments *a, const
     }
     if (a->overlay)
         printf("overlay    %s\n", a->overlay);
+    return output_flush("lights");
 }
 
 static int print_json(const struct summary *s, const struct arguments *a, const struct lights *l)
@@ -213,13 +209,7 @@ static int print_json(const struct summary *s, const struct arguments *a, const 
     json_set_string(doc, "output", a->output);
     if (a->overlay)
         json_set_string(doc, "overlay", a->overlay);
-    char *text = json_text(doc);
-    json_free(doc);
-    if (!text)
-        return -ENOMEM;
-    puts(text);
-    free(text);
-    return 0;
+    return output_json("lights", doc);
 }
 
 // ---- the overlay --------------------------------------------------------------------------------
@@ -362,14 +352,7 @@ int command_lights(int argc, char **argv)
         err = write_overlay(&a, &p, &l, &s);
     if (err)
         goto done;
-    if (a.json)
-        err = print_json(&s, &a, &l);
-    else
-        print_text(&s, &a, &l);
-    if (!err && fflush(stdout)) {
-        err = -errno;
-        log_error("lights: cannot print: %s", strerror(-err));
-    }
+    err = a.json ? print_json(&s, &a, &l) : print_text(&s, &a, &l);
 done:
     lights_free(&l);
     panorama_free(&p);

@@ -5,7 +5,9 @@
 // names the mesh and may say how its pictures were made ("render": samples, shadows, ...). Options
 // beat the report.
 #include "solver/cameras.h"
+#include "solver/commands/arguments.h"
 #include "solver/commands/commands.h"
+#include "solver/commands/output.h"
 #include "solver/panorama.h"
 #include "solver/render.h"
 #include "solver/take/atomic_file.h"
@@ -20,7 +22,6 @@
 #include <stdio.h>
 #include <stdlib.h>
 #include <string.h>
-#include <time.h>
 #include <unistd.h>
 
 enum {
@@ -75,22 +76,10 @@ struct arguments {
     bool no_shadows, json;
 };
 
-static int number(struct argp_state *state, const char *option, const char *text, long low,
-                  long high)
-{
-    char *end;
-    const long value = strtol(text, &end, 10);
-    if (end == text || *end || value < low || value > high)
-        argp_error(state, "%s %s: expected a whole number from %ld to %ld", option, text, low,
-                   high);
-    return (int)value;
-}
-
 static error_t parse(int key, char *text, struct argp_state *state)
 {
     struct arguments *a = state->input;
     char *end;
-    int n = 0;
     switch (key) {
     case KEY_CAMERAS:
         a->cameras = text;
@@ -108,9 +97,7 @@ static error_t parse(int key, char *text, struct argp_state *state)
         a->probe = text;
         return 0;
     case 'n':
-        a->n_lights = number(state, "-n", text, 1, LIGHTS_MAX);
-        if (a->n_lights & (a->n_lights - 1))
-            argp_error(state, "-n %s: expected a power of two from 1 to %d", text, LIGHTS_MAX);
+        a->n_lights = argument_power_of_two(state, "-n", text, LIGHTS_MAX);
         return 0;
     case KEY_PANELS:
         a->panels = text;
@@ -124,18 +111,16 @@ static error_t parse(int key, char *text, struct argp_state *state)
         a->mesh = text;
         return 0;
     case KEY_SIZE:
-        if (sscanf(text, "%5dx%5d%n", &a->width_px, &a->height_px, &n) != 2 || text[n] ||
-            a->width_px < 1 || a->height_px < 1 || a->width_px > 16384 || a->height_px > 16384)
-            argp_error(state, "--size %s: expected WxH, each from 1 to 16384", text);
+        argument_size(state, "--size", text, 1, 16384, &a->width_px, &a->height_px);
         return 0;
     case KEY_SAMPLES:
-        a->samples = number(state, "--samples", text, 1, 16);
+        a->samples = (int)argument_integer(state, "--samples", text, 1, 16);
         return 0;
     case KEY_NO_SHADOWS:
         a->no_shadows = true;
         return 0;
     case KEY_THREADS:
-        a->n_threads = number(state, "--threads", text, 1, 256);
+        a->n_threads = (int)argument_integer(state, "--threads", text, 1, 256);
         return 0;
     case KEY_JSON:
         a->json = true;
@@ -304,34 +289,6 @@ static int read_mesh(struct scene *s, const struct arguments *a)
 
 // ---- light from a panorama ----------------------------------------------------------------------
 
-static int read_probe(struct lights *l, const char *path)
-{
-    struct json *doc;
-    double square[9], R[9], transposed[9];
-    int err = json_read(&doc, path);
-    if (err)
-        return err;
-    err = json_require_numbers(doc, "world_from_probe", R, 9, path);
-    if (!err)
-        err = json_require_numbers(doc, "centre_m", l->centre_m, 3, path);
-    json_free(doc);
-    if (err)
-        return err;
-    for (int i = 0; i < 9; i++)
-        transposed[i] = R[3 * (i % 3) + i / 3];
-    mat3_mul(square, R, transposed);
-    for (int i = 0; i < 9; i++) {
-        if (fabs(square[i] - (i % 4 == 0)) <= 1e-6 && mat3_det(R) > 0)
-            continue;
-        log_error("render: %s: world_from_probe is not a rotation (rows orthonormal to 1e-6, "
-                  "determinant 1)",
-                  path);
-        return -EINVAL;
-    }
-    memcpy(l->world_from_probe, R, sizeof(R));
-    return 0;
-}
-
 struct panel {
     double corner[3], side[2][3], normal[3]; // the front is where the normal points
 };
@@ -408,7 +365,7 @@ static int cut_panorama(struct lights *out, const struct arguments *a)
     err = lights_median_cut(out, &panorama, a->n_lights);
     panorama_free(&panorama);
     if (!err)
-        err = read_probe(out, a->probe);
+        err = lights_read_pose(out, NULL, a->probe);
     if (!err && a->panels)
         err = read_panels(&panels, &n_panels, a->panels);
     for (int i = 0; !err && i < out->n; i++) {
@@ -464,20 +421,16 @@ static int read_scene(struct scene *s, const struct arguments *a)
 
 static int render_one(const struct renderer *renderer, const struct camera *camera, const char *dir)
 {
-    char name[CAMERA_NAME_MAX + 8], path[PATH_MAX];
     struct image image;
     int err = render_view(renderer, camera, &image);
     if (err)
         return err;
-    snprintf(name, sizeof(name), "%s.exr", camera->name);
-    err = join(path, dir, name);
+    char *exr = output_path(dir, camera->name, "exr"), *png = output_path(dir, camera->name, "png");
+    err = exr && png ? image_write_exr(&image, exr, IMAGE_FLOAT, IMAGE_ZIP) : -ENOMEM;
     if (!err)
-        err = image_write_exr(&image, path, IMAGE_FLOAT, IMAGE_ZIP);
-    snprintf(name, sizeof(name), "%s.png", camera->name);
-    if (!err)
-        err = join(path, dir, name);
-    if (!err)
-        err = image_write_png_srgb(&image, path, 0);
+        err = image_write_png_srgb(&image, png, 0);
+    free(exr);
+    free(png);
     image_free(&image);
     return err;
 }
@@ -497,11 +450,7 @@ static int print_summary(const struct scene *s, const struct arguments *a, doubl
     for (int i = 0; i < s->cameras.n; i++)
         json_append_string(views, s->cameras.view[i].name);
     json_set(doc, "views", views);
-    char *text = json_text(doc);
-    json_free(doc);
-    const bool printed = text && puts(text) >= 0 && !fflush(stdout);
-    free(text);
-    return printed ? 0 : -EIO;
+    return output_json("render", doc);
 }
 
 int command_render(int argc, char **argv)
@@ -509,9 +458,8 @@ int command_render(int argc, char **argv)
     struct arguments a = {.radius_m = 3, .n_lights = 256};
     struct scene s = {0};
     struct renderer *renderer = NULL;
-    struct timespec start, end;
     argp_parse(&argp, argc, argv, 0, 0, &a);
-    clock_gettime(CLOCK_MONOTONIC, &start);
+    const double begin_s = output_clock_s();
     int err = read_scene(&s, &a);
     if (!err)
         err = make_directories(a.output);
@@ -523,13 +471,10 @@ int command_render(int argc, char **argv)
             err = render_one(renderer, &s.cameras.view[i], a.output);
         progress_end();
     }
-    clock_gettime(CLOCK_MONOTONIC, &end);
+    if (!err && a.json)
+        err = print_summary(&s, &a, output_clock_s() - begin_s);
     if (err == -ENOMEM)
         log_error("render: out of memory");
-    if (!err && a.json)
-        err = print_summary(&s, &a,
-                            (double)(end.tv_sec - start.tv_sec) +
-                                1e-9 * (double)(end.tv_nsec - start.tv_nsec));
     renderer_free(renderer);
     scene_free(&s);
     return err ? EXIT_FAILED : EXIT_DONE;

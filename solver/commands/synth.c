@@ -1,5 +1,7 @@
 // solver/commands/synth.c - rigsolve synth: a synthetic studio on disk, with its known answer.
+#include "solver/commands/arguments.h"
 #include "solver/commands/commands.h"
+#include "solver/commands/output.h"
 #include "solver/synth.h"
 #include "solver/take/json.h"
 #include "solver/take/log.h"
@@ -8,7 +10,6 @@
 #include <errno.h>
 #include <limits.h>
 #include <stdio.h>
-#include <stdlib.h>
 #include <string.h>
 
 enum {
@@ -57,55 +58,37 @@ struct arguments {
     bool json;
 };
 
-static long long number(struct argp_state *state, const char *option, const char *text,
-                        long long low, long long high)
-{
-    char *end;
-    const long long value = strtoll(text, &end, 10);
-    if (end == text || *end || value < low || value > high)
-        argp_error(state, "--%s: '%s' is not a whole number from %lld to %lld", option, text, low,
-                   high);
-    return value;
-}
-
 static error_t parse(int key, char *text, struct argp_state *state)
 {
     struct arguments *a = state->input;
     struct synth_settings *s = &a->settings;
-    char *end;
     switch (key) {
     case 'o':
         a->dir = text;
         return 0;
     case KEY_SEED:
-        s->seed = (uint64_t)number(state, "seed", text, 0, LLONG_MAX);
+        s->seed = (uint64_t)argument_integer(state, "--seed", text, 0, INT64_MAX);
         return 0;
     case KEY_LIGHTS:
-        s->n_true_lights = (int)number(state, "true-lights", text, 16, 65536);
+        s->n_true_lights = (int)argument_integer(state, "--true-lights", text, 16, 65536);
         return 0;
     case KEY_NOISE:
-        s->noise = strtod(text, &end);
-        if (end == text || *end || !(s->noise >= 0 && s->noise <= 1))
-            argp_error(state, "--noise: '%s' is not a number from 0 to 1", text);
+        s->noise = argument_number(state, "--noise", text, "a number", 0, 1);
         return 0;
-    case KEY_SIZE: {
-        int n = 0;
-        if (sscanf(text, "%4dx%4d%n", &s->width_px, &s->height_px, &n) != 2 || text[n] ||
-            s->width_px < 16 || s->height_px < 16 || s->width_px > 8192 || s->height_px > 8192)
-            argp_error(state, "--size: '%s' is not WxH, each from 16 to 8192 (360x240)", text);
+    case KEY_SIZE:
+        argument_size(state, "--size", text, 16, 8192, &s->width_px, &s->height_px);
         return 0;
-    }
     case KEY_VIEWS:
-        s->n_views = (int)number(state, "views", text, 1, 999);
+        s->n_views = (int)argument_integer(state, "--views", text, 1, 999);
         return 0;
     case KEY_SAMPLES:
-        s->samples = (int)number(state, "samples", text, 1, 16);
+        s->samples = (int)argument_integer(state, "--samples", text, 1, 16);
         return 0;
     case KEY_TEXTURE:
-        s->texture_size = (int)number(state, "texture", text, 32, 8192);
+        s->texture_size = (int)argument_integer(state, "--texture", text, 32, 8192);
         return 0;
     case KEY_PANORAMA:
-        s->panorama_width_px = (int)number(state, "panorama-width", text, 32, 16384);
+        s->panorama_width_px = (int)argument_integer(state, "--panorama-width", text, 32, 16384);
         return 0;
     case KEY_SHAPE:
         s->shape = text;
@@ -123,7 +106,7 @@ static error_t parse(int key, char *text, struct argp_state *state)
         s->final_float = true;
         return 0;
     case KEY_THREADS:
-        s->n_threads = (int)number(state, "threads", text, 1, 256);
+        s->n_threads = (int)argument_integer(state, "--threads", text, 1, 256);
         return 0;
     case KEY_JSON:
         a->json = true;
@@ -184,9 +167,5 @@ int command_synth(int argc, char **argv)
     if (snprintf(path, sizeof(path), "%s/truth/report.json", a.dir) >= (int)sizeof(path) ||
         json_read(&report, path))
         return EXIT_FAILED;
-    char *text = json_text(report);
-    json_free(report);
-    const bool printed = text && puts(text) >= 0 && !fflush(stdout);
-    free(text);
-    return printed ? EXIT_DONE : EXIT_FAILED;
+    return output_json("synth", report) ? EXIT_FAILED : EXIT_DONE;
 }

@@ -1,18 +1,15 @@
 // solver/commands/visibility.c - rigsolve visibility: which cameras and lights see which texel, as
 // pictures and numbers.
-#include "solver/cameras.h"
+#include "solver/commands/arguments.h"
 #include "solver/commands/commands.h"
-#include "solver/lights.h"
-#include "solver/mesh.h"
+#include "solver/commands/inputs.h"
+#include "solver/commands/output.h"
 #include "solver/parallel.h"
-#include "solver/rays.h"
 #include "solver/take/atomic_file.h"
 #include "solver/take/image.h"
 #include "solver/take/json.h"
 #include "solver/take/log.h"
 #include "solver/take/progress.h"
-#include "solver/take/take.h"
-#include "solver/texels.h"
 #include "solver/vec3.h"
 #include "solver/visibility.h"
 
@@ -22,32 +19,25 @@
 #include <stdio.h>
 #include <stdlib.h>
 #include <string.h>
-#include <time.h>
-#include <unistd.h>
 
 // ---- arguments ----
 
 struct settings {
-    const char *take, *mesh, *cameras, *panorama, *lights, *world_from_probe, *images, *out,
-        *overlay;
-    int n_lights, texture, n_sub, n_threads;
+    struct inputs in;
+    const char *lights, *out, *overlay;
+    int n_lights, n_sub, n_threads;
     uint64_t seed;
     double grazing_cos, distance_m, centre_m[3];
     bool has_centre, json;
 };
 
 enum {
-    OPTION_MESH = 256,
-    OPTION_CAMERAS,
-    OPTION_PANORAMA,
-    OPTION_LIGHTS,
-    OPTION_WORLD_FROM_PROBE,
+    OPTION_LIGHTS = 256,
     OPTION_TEXTURE,
     OPTION_SOFT,
     OPTION_GRAZING,
     OPTION_CENTRE,
     OPTION_DISTANCE,
-    OPTION_IMAGES,
     OPTION_OVERLAY,
     OPTION_THREADS,
     OPTION_SEED,
@@ -55,22 +45,15 @@ enum {
 };
 
 static const struct argp_option options[] = {
-    { 0, 0, 0, 0, "Input (with TAKE: in place of the take's own)", 1 },
-    { "mesh", OPTION_MESH, "FILE", 0, "OBJ, PLY, glTF or GLB with a UV atlas", 1 },
-    { "cameras", OPTION_CAMERAS, "PATH", 0, "calibrated views: a COLMAP folder", 1 },
-    { "panorama", OPTION_PANORAMA, "FILE", 0, "HDR panorama the lights are cut from", 1 },
     { "lights", OPTION_LIGHTS, "N|FILE", 0,
       "how many lights to cut from the panorama (a power of two; default 256), or a lights.json",
       1 },
-    { "world-from-probe", OPTION_WORLD_FROM_PROBE, "FILE", 0,
-      "JSON with world_from_probe (3x3) and perhaps centre_m; default: the take's start.json", 1 },
     { "centre", OPTION_CENTRE, "X,Y,Z", 0,
       "where the panorama was taken, metres; default: what lights.json says by the places of its "
       "lights, else the middle of the mesh's bounding box", 1 },
     { "distance", OPTION_DISTANCE, "M", 0,
       "distance of all lights from there, metres; default: infinity (or what lights.json says)",
       1 },
-    { "images", OPTION_IMAGES, "DIR", 0, "the views' pictures, for --overlay", 1 },
     { 0, 0, 0, 0, "What is traced", 2 },
     { "texture", OPTION_TEXTURE, "N", 0, "N x N texels (default 512)", 2 },
     { "grazing", OPTION_GRAZING, "COS", 0,
@@ -101,95 +84,45 @@ static const char doc[] =
     "reaches it. lights.bin: one bit per texel and light (solver/visibility.h).\n\n"
     "Exit status: 0 done, 1 failed, 2 usage, 3 done, but no camera sees the mesh.";
 
-static long long integer_of(struct argp_state *state, const char *option, const char *text,
-                            long long least, long long most)
-{
-    char *end;
-    errno = 0;
-    const long long value = strtoll(text, &end, 10);
-    if (end == text || *end || errno || value < least || value > most)
-        argp_error(state, "--%s '%s': expected a whole number from %lld to %lld", option, text,
-                   least, most);
-    return value;
-}
-
-static double number_of(struct argp_state *state, const char *option, const char *text,
-                        double least, double most)
-{
-    char *end;
-    const double value = strtod(text, &end);
-    if (end == text || *end || !(value >= least && value <= most))
-        argp_error(state, "--%s '%s': expected a number from %g to %g", option, text, least, most);
-    return value;
-}
-
-static void parse_centre(struct argp_state *state, const char *text, double centre_m[3])
-{
-    const char *at = text;
-    for (int c = 0; c < 3; c++) {
-        char *end;
-        centre_m[c] = strtod(at, &end);
-        if (end == at || *end != (c < 2 ? ',' : '\0') || !(fabs(centre_m[c]) <= 1e9))
-            argp_error(state, "--centre '%s': expected three numbers in metres, as 0,0.1,1.2",
-                       text);
-        at = end + 1;
-    }
-}
-
 static error_t parse_option(int key, char *text, struct argp_state *state)
 {
     struct settings *s = state->input;
     switch (key) {
-    case OPTION_MESH:
-        s->mesh = text;
-        return 0;
-    case OPTION_CAMERAS:
-        s->cameras = text;
-        return 0;
-    case OPTION_PANORAMA:
-        s->panorama = text;
-        return 0;
     case OPTION_LIGHTS:
         // All digits: a number. Anything else names a file.
         s->lights = text[strspn(text, "0123456789")] ? text : NULL;
         if (!s->lights) {
-            s->n_lights = (int)integer_of(state, "lights", text, 1, LIGHTS_MAX);
+            s->n_lights = (int)argument_integer(state, "--lights", text, 1, LIGHTS_MAX);
             if (s->n_lights & (s->n_lights - 1))
                 argp_error(state,
                            "--lights '%s': expected a power of two up to %d, or a lights.json",
                            text, LIGHTS_MAX);
         }
         return 0;
-    case OPTION_WORLD_FROM_PROBE:
-        s->world_from_probe = text;
-        return 0;
     case OPTION_CENTRE:
-        parse_centre(state, text, s->centre_m);
+        argument_point(state, "--centre", text, s->centre_m);
         s->has_centre = true;
         return 0;
     case OPTION_DISTANCE:
-        s->distance_m = number_of(state, "distance", text, 1e-3, 1e6);
-        return 0;
-    case OPTION_IMAGES:
-        s->images = text;
+        s->distance_m = argument_number(state, "--distance", text, "a number", 1e-3, 1e6);
         return 0;
     case OPTION_TEXTURE:
-        s->texture = (int)integer_of(state, "texture", text, 1, 16384);
+        s->in.texture = (int)argument_integer(state, "--texture", text, 1, 16384);
         return 0;
     case OPTION_GRAZING:
-        s->grazing_cos = number_of(state, "grazing", text, 0, 1);
+        s->grazing_cos = argument_number(state, "--grazing", text, "a number", 0, 1);
         return 0;
     case OPTION_SOFT:
-        s->n_sub = (int)integer_of(state, "soft", text, 0, 16);
+        s->n_sub = (int)argument_integer(state, "--soft", text, 0, 16);
         if (s->n_sub > 0 && s->n_sub < 4)
             argp_error(state, "--soft '%s': expected 0 (off) or 4 to 16", text);
         s->n_sub = s->n_sub ? s->n_sub : 1;
         return 0;
     case OPTION_THREADS:
-        s->n_threads = (int)integer_of(state, "threads", text, 1, 256);
+        s->n_threads = (int)argument_integer(state, "--threads", text, 1, 256);
         return 0;
     case OPTION_SEED:
-        s->seed = (uint64_t)integer_of(state, "seed", text, 0, INT64_MAX);
+        s->seed = (uint64_t)argument_integer(state, "--seed", text, 0, INT64_MAX);
         return 0;
     case OPTION_OVERLAY:
         s->overlay = text;
@@ -200,18 +133,17 @@ static error_t parse_option(int key, char *text, struct argp_state *state)
     case 'o':
         s->out = text;
         return 0;
-    case ARGP_KEY_ARG:
-        if (s->take)
-            argp_error(state, "a second take '%s': expected one", text);
-        s->take = text;
+    case ARGP_KEY_INIT:
+        state->child_inputs[0] = &s->in;
         return 0;
     case ARGP_KEY_END:
-        if (!s->take && (!s->mesh || !s->cameras))
-            argp_error(state, "expected a TAKE, or --mesh and --cameras");
         if (!s->out)
             argp_error(state, "no -o DIR: where shall the result go?");
-        if (s->overlay && !s->take && !s->images)
+        if (!s->overlay)
+            return 0;
+        if (!s->in.take_dir && !s->in.images_dir)
             argp_error(state, "--overlay needs pictures: a TAKE, or --images DIR");
+        s->in.needs |= TAKE_VIEWS;
         return 0;
     default:
         return ARGP_ERR_UNKNOWN;
@@ -221,13 +153,8 @@ static error_t parse_option(int key, char *text, struct argp_state *state)
 // ---- what is loaded ----
 
 struct scene {
-    struct take *take;
-    struct mesh mesh;
-    struct rays *rays;
-    struct texels texels;
-    struct cameras cameras;
-    struct panorama panorama; // no pixels: none
-    struct lights lights;     // n = 0: none
+    struct inputs in;
+    struct lights lights; // n = 0: none
     struct light_visibility visibility;
 };
 
@@ -235,127 +162,25 @@ static void free_scene(struct scene *s)
 {
     light_visibility_free(&s->visibility);
     lights_free(&s->lights);
-    panorama_free(&s->panorama);
-    cameras_free(&s->cameras);
-    texels_free(&s->texels);
-    rays_free(s->rays);
-    mesh_free(&s->mesh);
-    take_close(s->take);
-}
-
-static int open_take(struct scene *scene, struct settings *s)
-{
-    if (!s->take)
-        return 0;
-    int err = take_open(&scene->take, s->take);
-    if (err)
-        return err;
-    err = take_require(scene->take, (s->mesh ? 0 : TAKE_MESH) | (s->cameras ? 0 : TAKE_CAMERAS) |
-                                        (s->overlay && !s->images ? TAKE_VIEWS : 0));
-    if (err)
-        return err;
-    if (!s->mesh)
-        s->mesh = scene->take->mesh_path;
-    if (!s->cameras)
-        s->cameras = scene->take->cameras_path;
-    if (!s->panorama)
-        s->panorama = scene->take->panorama_path;
-    if (!s->world_from_probe && !s->lights)
-        s->world_from_probe = scene->take->start_path;
-    return 0;
-}
-
-// R, and c if the file has it.
-static int read_world_from_probe(const char *path, struct lights *l, bool *has_centre)
-{
-    struct json *doc_ = NULL;
-    double rotation[9], centre_m[3], gram[9];
-    int err = json_read(&doc_, path);
-    if (err)
-        return err;
-    err = json_require_numbers(doc_, "world_from_probe", rotation, 9, path);
-    if (err)
-        goto done;
-    for (int i = 0; i < 3; i++)
-        for (int j = 0; j < 3; j++)
-            gram[3 * i + j] = vec3_dot(rotation + 3 * i, rotation + 3 * j) - (i == j);
-    for (int i = 0; i < 9; i++)
-        if (!(fabs(gram[i]) < 1e-4) || !(mat3_det(rotation) > 0)) {
-            log_error("visibility: %s: world_from_probe is not a rotation (determinant %g): "
-                      "expected three "
-                      "orthonormal rows, right-handed",
-                      path, mat3_det(rotation));
-            err = -EINVAL;
-            goto done;
-        }
-    memcpy(l->world_from_probe, rotation, sizeof(rotation));
-    if (json_get(doc_, "centre_m")) {
-        err = json_require_numbers(doc_, "centre_m", centre_m, 3, path);
-        if (err)
-            goto done;
-        memcpy(l->centre_m, centre_m, sizeof(centre_m));
-        *has_centre = true;
-    }
-done:
-    json_free(doc_);
-    return err;
+    inputs_free(&s->in);
 }
 
 static int load_lights(struct scene *scene, const struct settings *s)
 {
-    if (!s->panorama && !s->lights)
-        return 0;
-    const bool needs_pixels = !s->lights || s->n_sub > 1;
-    int err = needs_pixels && s->panorama ? panorama_read(&scene->panorama, s->panorama) : 0;
-    if (err)
-        return err;
+    struct inputs *in = &scene->in;
     struct lights *l = &scene->lights;
-    err = s->lights ? lights_read_json(l, s->lights)
-                    : lights_median_cut(l, &scene->panorama, s->n_lights);
+    if (!in->panorama_path && !s->lights)
+        return 0;
+    int err = inputs_lights(l, in, s->lights, s->n_lights);
+    if (!err && s->lights && s->n_sub > 1 && in->panorama_path)
+        err = panorama_read(&in->panorama, in->panorama_path);
     if (err)
         return err;
-    bool has_centre = false; // a lights.json tells it by the places of its lights
-    for (int i = 0; s->lights && i < l->n; i++)
-        has_centre = has_centre || l->inverse_distance[i] > 0;
-    if (s->world_from_probe) {
-        err = read_world_from_probe(s->world_from_probe, l, &has_centre);
-        if (err)
-            return err;
-    } else if (!s->lights) {
-        log_warning(
-            "visibility: no --world-from-probe: the panorama is taken to have the world's axes");
-    }
-    for (int c = 0; c < 3; c++) {
-        if (s->has_centre)
-            l->centre_m[c] = s->centre_m[c];
-        else if (!has_centre)
-            l->centre_m[c] = (scene->mesh.bounds_m[0][c] + scene->mesh.bounds_m[1][c]) / 2;
-    }
+    if (s->has_centre)
+        memcpy(l->centre_m, s->centre_m, sizeof(l->centre_m));
     for (int i = 0; s->distance_m > 0 && i < l->n; i++)
         l->inverse_distance[i] = 1 / s->distance_m;
     return 0;
-}
-
-static int load(struct scene *scene, struct settings *s)
-{
-    struct mesh_check check;
-    int err = open_take(scene, s);
-    if (err)
-        return err;
-    err = mesh_read(&scene->mesh, &check, s->mesh);
-    if (err)
-        return err;
-    mesh_check_log(&check, &scene->mesh, s->mesh);
-    err = texels_rasterise(&scene->texels, &scene->mesh, s->texture);
-    if (err)
-        return err;
-    err = rays_new(&scene->rays, &scene->mesh);
-    if (err)
-        return err;
-    err = cameras_read(&scene->cameras, s->cameras);
-    if (err)
-        return err;
-    return load_lights(scene, s);
 }
 
 // ---- cameras ----
@@ -372,29 +197,10 @@ struct report {
     double camera_s, light_s;
 };
 
-static double now_s(void)
-{
-    struct timespec t;
-    clock_gettime(CLOCK_MONOTONIC, &t);
-    return (double)t.tv_sec + 1e-9 * (double)t.tv_nsec;
-}
-
-// dir/<name>.<extension>; a view's name may hold folders, a file's may not.
-static char *path_in(const char *dir, const char *name, const char *extension)
-{
-    char *path;
-    if (asprintf(&path, "%s/%s.%s", dir, name, extension) < 0)
-        return NULL;
-    for (char *p = path + strlen(dir) + 1; *p; p++)
-        if (*p == '/')
-            *p = '_';
-    return path;
-}
-
 static int write_bytes_png(const char *dir, const char *name, const struct texels *t,
                            const uint8_t *bytes)
 {
-    char *path = path_in(dir, name, "png");
+    char *path = output_path(dir, name, "png");
     const int err = path ? visibility_write_mask_png(bytes, t, path) : -ENOMEM;
     free(path);
     return err;
@@ -403,19 +209,19 @@ static int write_bytes_png(const char *dir, const char *name, const struct texel
 static int trace_cameras(const struct scene *scene, const struct settings *s, const char *dir,
                          struct report *report)
 {
-    const struct texels *t = &scene->texels;
-    const int n_views = scene->cameras.n;
+    const struct texels *t = &scene->in.texels;
+    const int n_views = scene->in.cameras.n;
     int err = -ENOMEM;
     uint8_t *mask = malloc((size_t)t->n);
     int *n_seeing = calloc((size_t)t->n, sizeof(n_seeing[0]));
     if (!mask || !n_seeing)
         goto done;
-    const double begin_s = now_s();
+    const double begin_s = output_clock_s();
     progress_begin("trace cameras", n_views);
     for (int i = 0; i < n_views; i++) {
-        const struct camera *camera = &scene->cameras.view[i];
+        const struct camera *camera = &scene->in.cameras.view[i];
         struct view_report *view = &report->view[i];
-        visibility_camera_mask(mask, scene->rays, t, camera, s->grazing_cos, s->n_threads);
+        visibility_camera_mask(mask, scene->in.rays, t, camera, s->grazing_cos, s->n_threads);
         for (int k = 0; k < t->n; k++) {
             view->n_visible += mask[k] == MASK_VISIBLE;
             view->n_grazing += mask[k] == MASK_GRAZING;
@@ -431,7 +237,7 @@ static int trace_cameras(const struct scene *scene, const struct settings *s, co
         progress_add(1);
     }
     progress_end();
-    report->camera_s = now_s() - begin_s;
+    report->camera_s = output_clock_s() - begin_s;
     for (int k = 0; k < t->n; k++) {
         report->n_seen_by_none += !n_seeing[k];
         mask[k] = (uint8_t)((255 * n_seeing[k] + n_views / 2) / (n_views ? n_views : 1));
@@ -455,7 +261,7 @@ static void shade_texels(void *arg, int64_t begin, int64_t end, int worker)
 {
     (void)worker;
     const struct shadow_job *job = arg;
-    const struct texels *t = &job->scene->texels;
+    const struct texels *t = &job->scene->in.texels;
     const struct lights *l = &job->scene->lights;
     const struct light_visibility *v = &job->scene->visibility;
     for (int64_t i = begin; i < end; i++) {
@@ -481,19 +287,19 @@ static void shade_texels(void *arg, int64_t begin, int64_t end, int worker)
 static int trace_lights(struct scene *scene, const struct settings *s, const char *dir,
                         struct report *report)
 {
-    const struct texels *t = &scene->texels;
+    const struct texels *t = &scene->in.texels;
     uint8_t *share = malloc((size_t)t->n), *lit = malloc((size_t)t->n);
-    char *path = path_in(dir, "lights", "bin");
+    char *path = output_path(dir, "lights", "bin");
     int err = -ENOMEM;
     if (!share || !lit || !path)
         goto done;
-    const double begin_s = now_s();
-    err = light_visibility_trace(&scene->visibility, scene->rays, t, &scene->lights,
-                                 scene->panorama.image.data ? &scene->panorama : NULL, s->n_sub,
-                                 s->seed, s->n_threads);
+    const double begin_s = output_clock_s();
+    err = light_visibility_trace(&scene->visibility, scene->in.rays, t, &scene->lights,
+                                 scene->in.panorama.image.data ? &scene->in.panorama : NULL,
+                                 s->n_sub, s->seed, s->n_threads);
     if (err)
         goto done;
-    report->light_s = now_s() - begin_s;
+    report->light_s = output_clock_s() - begin_s;
     err = light_visibility_write(&scene->visibility, t->size, path);
     if (err)
         goto done;
@@ -608,24 +414,6 @@ static double silhouette_iou(const struct image *image, const uint8_t *hit)
     return either ? (double)both / (double)either : 1;
 }
 
-// The picture of a view; NULL: there is none. The caller frees it.
-static char *picture_of(const struct scene *scene, const struct settings *s, const char *name)
-{
-    static const char *const extensions[] = { "exr", "tif", "tiff", "hdr", "png" };
-    for (int i = 0; s->images && i < 5; i++) {
-        char *path;
-        if (asprintf(&path, "%s/%s.%s", s->images, name, extensions[i]) < 0)
-            return NULL;
-        if (!access(path, F_OK))
-            return path;
-        free(path);
-    }
-    for (int i = 0; !s->images && scene->take && i < scene->take->n_views; i++)
-        if (!strcmp(scene->take->view_names[i], name))
-            return strdup(scene->take->view_paths[i]);
-    return NULL;
-}
-
 static int draw_view(const struct scene *scene, const struct settings *s, const struct camera *view,
                      const char *picture, struct view_report *report)
 {
@@ -637,11 +425,11 @@ static int draw_view(const struct scene *scene, const struct settings *s, const 
     if (image.width != camera.width_px || image.height != camera.height_px)
         camera_resize(&camera, image.width, image.height);
     uint8_t *hit = malloc((size_t)image.width * (size_t)image.height);
-    char *path = path_in(s->overlay, view->name, "png");
+    char *path = output_path(s->overlay, view->name, "png");
     err = -ENOMEM;
     if (hit && path) {
         parallel_for(s->n_threads, image.height, 4, trace_rows,
-                     &(struct silhouette_job){ scene->rays, &camera, hit });
+                     &(struct silhouette_job){ scene->in.rays, &camera, hit });
         report->iou = silhouette_iou(&image, hit);
         err = draw_outline(&image, hit, path);
         report->drawn = !err;
@@ -654,24 +442,20 @@ static int draw_view(const struct scene *scene, const struct settings *s, const 
 
 static int draw_overlays(const struct scene *scene, const struct settings *s, struct report *report)
 {
-    int n_drawn = 0, err = make_directories(s->overlay);
+    const struct inputs *in = &scene->in;
+    int err = make_directories(s->overlay);
     if (err)
         return err;
-    progress_begin("draw overlays", scene->cameras.n);
-    for (int i = 0; !err && i < scene->cameras.n; i++) {
-        const struct camera *view = &scene->cameras.view[i];
-        char *picture = picture_of(scene, s, view->name);
-        if (picture) {
-            err = draw_view(scene, s, view, picture, &report->view[i]);
-            n_drawn += report->view[i].drawn;
-        }
-        free(picture);
+    progress_begin("draw overlays", in->cameras.n);
+    for (int i = 0; !err && i < in->cameras.n; i++) {
+        if (in->picture[i])
+            err = draw_view(scene, s, &in->cameras.view[i], in->picture[i], &report->view[i]);
         progress_add(1);
     }
     progress_end();
-    if (!err && n_drawn < scene->cameras.n)
+    if (!err && in->n_pictures < in->cameras.n)
         log_warning("visibility: %d of %d views have no picture of their name: not drawn over",
-                    scene->cameras.n - n_drawn, scene->cameras.n);
+                    in->cameras.n - in->n_pictures, in->cameras.n);
     return err;
 }
 
@@ -694,43 +478,45 @@ static int64_t bytes_of(const struct light_visibility *v)
     return n * v->words_per_texel * 2 + (v->soft ? n * v->n_lights : 0);
 }
 
-static void print_text(const struct scene *scene, const struct report *report)
+static int print_text(const struct scene *scene, const struct report *report)
 {
     const struct light_visibility *v = &scene->visibility;
+    const struct texels *t = &scene->in.texels;
     printf("%-24s %9s %9s %9s %9s\n", "view", "visible", "grazing", "occluded", "outside");
-    for (int i = 0; i < scene->cameras.n; i++) {
+    for (int i = 0; i < scene->in.cameras.n; i++) {
         const struct view_report *view = &report->view[i];
-        printf("%-24s %9d %9d %9d %9d", scene->cameras.view[i].name, view->n_visible,
+        printf("%-24s %9d %9d %9d %9d", scene->in.cameras.view[i].name, view->n_visible,
                view->n_grazing, view->n_occluded, view->n_outside);
         if (view->drawn && view->iou >= 0)
             printf("  silhouette IoU %.4f", view->iou);
         putchar('\n');
     }
     printf("%d triangles, %d texels of %d x %d; %d seen by no camera; cameras took %.2f s\n",
-           scene->mesh.n_triangles, scene->texels.n, scene->texels.size, scene->texels.size,
-           report->n_seen_by_none, report->camera_s);
+           scene->in.mesh.n_triangles, t->n, t->size, t->size, report->n_seen_by_none,
+           report->camera_s);
     if (v->n_lights)
         printf("%d lights: %lld rays in %.2f s (%.2f Mray/s), %.1f %% below the horizon, %lld "
                "bytes; %d texels "
                "lit by nothing\n",
                v->n_lights, (long long)v->n_rays, report->light_s, mrays_per_s(scene, report),
                below_horizon_percent(v), (long long)bytes_of(v), report->n_lit_by_none);
+    return output_flush("visibility");
 }
 
 static int print_json(const struct scene *scene, const struct report *report)
 {
     const struct light_visibility *v = &scene->visibility;
     struct json *root = json_object(), *views = json_array();
-    json_set_int(root, "n_triangles", scene->mesh.n_triangles);
-    json_set_int(root, "texture", scene->texels.size);
-    json_set_int(root, "n_texels", scene->texels.n);
-    json_set_int(root, "n_views", scene->cameras.n);
+    json_set_int(root, "n_triangles", scene->in.mesh.n_triangles);
+    json_set_int(root, "texture", scene->in.texels.size);
+    json_set_int(root, "n_texels", scene->in.texels.n);
+    json_set_int(root, "n_views", scene->in.cameras.n);
     json_set_int(root, "n_seen_by_none", report->n_seen_by_none);
     json_set_number(root, "cameras_wall_s", report->camera_s);
-    for (int i = 0; i < scene->cameras.n; i++) {
+    for (int i = 0; i < scene->in.cameras.n; i++) {
         const struct view_report *view = &report->view[i];
         struct json *one = json_object();
-        json_set_string(one, "name", scene->cameras.view[i].name);
+        json_set_string(one, "name", scene->in.cameras.view[i].name);
         json_set_int(one, "visible", view->n_visible);
         json_set_int(one, "grazing", view->n_grazing);
         json_set_int(one, "occluded", view->n_occluded);
@@ -752,13 +538,7 @@ static int print_json(const struct scene *scene, const struct report *report)
         json_set_number(lights, "mrays_per_s", mrays_per_s(scene, report));
         json_set(root, "lights", lights);
     }
-    char *text = json_text(root);
-    json_free(root);
-    if (!text)
-        return -ENOMEM;
-    puts(text);
-    free(text);
-    return 0;
+    return output_json("visibility", root);
 }
 
 // 3 where every texel of every view is hidden or outside: the result exists, but mesh and cameras
@@ -766,37 +546,42 @@ static int print_json(const struct scene *scene, const struct report *report)
 static int judge(const struct scene *scene, const struct report *report)
 {
     int64_t n_visible = 0, n_outside = 0;
-    for (int i = 0; i < scene->cameras.n; i++) {
+    for (int i = 0; i < scene->in.cameras.n; i++) {
         n_visible += report->view[i].n_visible + report->view[i].n_grazing;
         n_outside += report->view[i].n_outside;
     }
     if (n_visible)
         return EXIT_DONE;
-    const double asked = (double)scene->cameras.n * scene->texels.n;
+    const double asked = (double)scene->in.cameras.n * scene->in.texels.n;
     log_error("visibility: none of %d cameras sees the mesh (%.0f %% of its texels fall outside "
               "the images, the rest face "
               "away or are blocked): are mesh and cameras in the same axes and units?",
-              scene->cameras.n, asked > 0 ? 100 * (double)n_outside / asked : 0);
+              scene->in.cameras.n, asked > 0 ? 100 * (double)n_outside / asked : 0);
     return EXIT_NOT_TRUSTED;
 }
 
 int command_visibility(int argc, char **argv)
 {
-    struct settings s = { .n_lights = 256,
-                          .texture = 512,
+    struct settings s = { .in.needs = TAKE_MESH | TAKE_CAMERAS,
+                          .in.texture = 512,
+                          .in.png_too = true,
+                          .n_lights = 256,
                           .n_sub = 1,
                           .seed = 1,
                           .grazing_cos = MASK_GRAZING_COS_PERCENT / 100. };
-    const struct argp argp = { options, parse_option, "[TAKE]", doc, NULL, NULL, NULL };
+    const struct argp_child children[] = { { &inputs_argp, 0, NULL, 0 }, { 0 } };
+    const struct argp argp = { options, parse_option, "[TAKE]", doc, children, NULL, NULL };
     argp_parse(&argp, argc, argv, 0, NULL, &s);
 
-    struct scene scene = { 0 };
+    struct scene scene = { .in = s.in };
     struct report report = { 0 };
     char *dir = NULL;
-    int status = EXIT_FAILED, err = load(&scene, &s);
+    int status = EXIT_FAILED, err = inputs_load(&scene.in);
+    if (!err)
+        err = load_lights(&scene, &s);
     if (err)
         goto done;
-    report.view = calloc((size_t)scene.cameras.n + 1, sizeof(report.view[0]));
+    report.view = calloc((size_t)scene.in.cameras.n + 1, sizeof(report.view[0]));
     if (!report.view || asprintf(&dir, "%s/visibility", s.out) < 0) {
         dir = NULL;
         err = -ENOMEM;
@@ -811,10 +596,7 @@ int command_visibility(int argc, char **argv)
         err = draw_overlays(&scene, &s, &report);
     if (err)
         goto done;
-    if (s.json)
-        err = print_json(&scene, &report);
-    else
-        print_text(&scene, &report);
+    err = s.json ? print_json(&scene, &report) : print_text(&scene, &report);
     if (!err)
         status = judge(&scene, &report);
 done:
