@@ -11,7 +11,7 @@
 #include <string.h>
 
 // The inner loops over columns, for the vectors that the machine has.
-#if defined(__x86_64__) && defined(__OPTIMIZE__) && !defined(__SANITIZE_ADDRESS__) && !defined(__SANITIZE_THREAD__)
+#if defined(__x86_64__) && defined(__OPTIMIZE__) && !defined(__clang__) && !defined(__SANITIZE_ADDRESS__) && !defined(__SANITIZE_THREAD__)
 #define VECTOR_CLONES __attribute__((target_clones("avx512f", "avx2", "default"), optimize("O3")))
 #else
 #define VECTOR_CLONES
@@ -188,10 +188,10 @@ static int job_new(struct job *j, const struct photometric *p, struct photometri
         j->column[i] = is_free[i] ? j->n_free++ : -1;
     if (!j->column)
         goto fail;
-    j->run = s->lights.n / p->n_groups;
-    for (int i = 0; i < s->lights.n; i++)
+    j->run = s->lights.n / p->n_groups; // 0 where groups are more than lights
+    for (int i = 0; j->run && i < s->lights.n; i++)
         if (!is_free || p->group_of_light[i] != i / j->run || j->column[j->layout.inverse_distance + i / j->run] < 0)
-            j->run = 0, i = s->lights.n;
+            j->run = 0;
     for (int i = 0; j->workers && i < j->n_workers; i++) {
         struct worker *w = &j->workers[i];
         w->seen = malloc(MAX_VIEWS_PER_TEXEL * sizeof(*w->seen));
