@@ -271,19 +271,19 @@ static void set_bounds(struct stage1 *s)
     }
 }
 
-static void trace_visibility(struct stage1 *s)
+static int trace_visibility(struct stage1 *s)
 {
     if (!s->set->visibility || !s->rays)
-        return;
-    if (!s->visibility.bits) {
-        if (light_visibility_trace(&s->visibility, s->rays, s->p.texels, &s->base.lights, NULL, 1, 0, s->set->n_threads))
-            return;
-    } else {
-        light_visibility_refresh(&s->visibility, s->rays, s->p.texels, &s->base.lights, NULL, .5 * M_PI / 180, 0,
-                                 s->set->n_threads);
-    }
+        return 0;
+    const double moved_rad = .5 * M_PI / 180;
+    const int err = s->visibility.bits
+                        ? light_visibility_refresh(&s->visibility, s->rays, s->p.texels, &s->base.lights, NULL, moved_rad, 0,
+                                                   s->set->n_threads)
+                        : light_visibility_trace(&s->visibility, s->rays, s->p.texels, &s->base.lights, NULL, 1, 0,
+                                                 s->set->n_threads);
     s->p.visible = s->visibility.bits;
     s->p.words_per_texel = s->visibility.words_per_texel;
+    return err < 0 ? err : 0; // refresh counts
 }
 
 // LM from base; base is the result. cost may be NULL.
@@ -373,14 +373,25 @@ static void stage1_free(struct stage1 *s)
     memset(s, 0, sizeof(*s));
 }
 
+// Over the texels that the views in s->p saw: others have no albedo to be judged.
 static int measure(const struct stage1 *s, const struct photometric_state *state, const uint8_t *use_view,
                    struct photometric_error *e)
 {
+    const struct samples *m = s->p.samples;
     struct photometric p = s->p;
+    uint8_t *fitted = calloc((size_t)m->n_texels, 1);
+    if (!fitted)
+        return -ENOMEM;
+    for (int t = 0; t < m->n_texels; t++)
+        for (int64_t i = m->first[t]; i < m->first[t + 1]; i++)
+            fitted[t] |= !s->p.use_view || s->p.use_view[m->view[i]];
     p.use_view = use_view;
+    p.use_texel = fitted;
     p.weight = NULL;
     p.texel_step = 1;
-    return photometric_evaluate(&p, (struct photometric_state *)state, false, e);
+    const int err = photometric_evaluate(&p, (struct photometric_state *)state, false, e);
+    free(fitted);
+    return err;
 }
 
 // Runs of `run` lights become one: the sum of their irradiance, from its mean direction.
@@ -427,7 +438,9 @@ static int sweep(const struct photometric *p, const struct lights *lights, const
         err = stage1_new(&s, &coarse, lights, rays, set);
         if (!err) {
             set_distances(&s, n == 1 ? set->start_distance_m : distances_m[k]);
-            trace_visibility(&s);
+            err = trace_visibility(&s);
+        }
+        if (!err) {
             err = minimise(&s, 12, 1e-4, &cost);
         }
         if (!err && cost < *best_cost) {
@@ -460,8 +473,9 @@ static int continuation(struct stage1 *s, const uint8_t *aside)
         struct photometric_error e;
         s->w_sim = weight[n] = w > last ? w : last;
         s->p.texel_step = coarse_step;
-        trace_visibility(s);
-        err = minimise(s, 6, 1e-2, NULL);
+        err = trace_visibility(s);
+        if (!err)
+            err = minimise(s, 6, 1e-2, NULL);
         s->p.texel_step = 1;
         if (!err) // the albedo of every texel, for the views set aside
             err = photometric_evaluate(&s->p, &s->base, s->p.albedo == ALBEDO_FREE, &e);
@@ -498,11 +512,10 @@ static int continuation(struct stage1 *s, const uint8_t *aside)
 static int refine(struct stage1 *s, const uint8_t *fit)
 {
     float *weight = NULL;
-    int err = 0;
     s->p.use_view = fit;
     s->p.texel_step = 1;
-    trace_visibility(s);
-    if (s->set->robust) {
+    int err = trace_visibility(s);
+    if (!err && s->set->robust) {
         double sigma;
         weight = malloc((size_t)s->p.samples->n * sizeof(float) + 1);
         err = weight ? photometric_scale(&s->p, &s->base, &sigma) : -ENOMEM;
@@ -732,14 +745,13 @@ static int uncertainty(struct stage1 *s, struct joint_result *out)
             A[i * n + i] *= 1 + 1e-12;
         const int singular = lm_inverse((int)n, A, is_free, C);
         const double scale = singular ? NAN : out->objective / fmax(3 * (double)e.n, 1);
-        for (int i = 0; i < DISNEY_N; i++)
-            out->theta_std[i] = s->is_free[s->layout.theta + i] ? sqrt(scale * C[(size_t)(s->layout.theta + i) * (n + 1)]) : 0;
-        for (int i = 0; i < 3; i++) {
-            out->centre_std_m[i] = sqrt(scale * C[(size_t)(s->layout.centre + i) * (n + 1)]);
-            out->rotation_std_rad[i] = sqrt(scale * C[(size_t)(s->layout.rotation + i) * (n + 1)]);
-        }
-        for (int k = 0; k < s->p.n_groups; k++)
-            out->inverse_distance_std[k] = sqrt(scale * C[(size_t)(s->layout.inverse_distance + k) * (n + 1)]);
+        double deviation[n]; // infinite: nothing depends on it
+        for (size_t i = 0; i < n; i++)
+            deviation[i] = is_free[i] ? sqrt(scale * C[i * (n + 1)]) : INFINITY;
+        memcpy(out->theta_std, deviation + s->layout.theta, sizeof(out->theta_std));
+        memcpy(out->centre_std_m, deviation + s->layout.centre, sizeof(out->centre_std_m));
+        memcpy(out->rotation_std_rad, deviation + s->layout.rotation, sizeof(out->rotation_std_rad));
+        memcpy(out->inverse_distance_std, deviation + s->layout.inverse_distance, (size_t)s->p.n_groups * sizeof(double));
     }
     free(A);
     free(C);
@@ -801,10 +813,12 @@ int joint_solve(struct joint_result *out, const struct texels *texels, const str
         log_error("joint: no view sees the mesh: are mesh and cameras in one frame?");
         err = -EINVAL;
     }
+    struct joint_settings directional = *set;
     if (!err && set->model == REFLECT_LAMBERT && set->albedo == ALBEDO_FREE && set->method != METHOD_DIRECTIONAL) {
-        log_error("joint: %s", joint_doubt_text(DOUBT_NO_INFORMATION));
+        log_warning("joint: %s; the lights are left at infinity", joint_doubt_text(DOUBT_NO_INFORMATION));
         out->doubts |= DOUBT_NO_INFORMATION;
-        err = -EINVAL;
+        directional.method = METHOD_DIRECTIONAL;
+        set = &directional;
     }
     if (!err) {
         p.use_view = fit;

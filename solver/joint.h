@@ -29,7 +29,7 @@ struct joint_settings {
 struct joint_settings joint_defaults(enum method method);
 
 enum joint_doubt { // why an answer is not to be trusted; bits
-    DOUBT_NO_INFORMATION = 1, // diffuse with free albedo: nothing says how far the lights are
+    DOUBT_NO_INFORMATION = 1, // diffuse with free albedo: nothing says how far the lights are; solved as directional
     DOUBT_FEW_VIEWS = 2,      // fewer than 3 views see the object
     DOUBT_MIRRORED = 4,       // the mirrored panorama explains the pictures better
     DOUBT_UNCERTAIN = 8,      // the standard deviation of the centre is above 10 cm, or the distances' median above 15 %
@@ -45,6 +45,8 @@ struct joint_result {
     double w_sim;                    // the last one, our normalisation (mean); w_sim_sum: the paper's (sum)
     double w_sim_sum;
     const char *stop_reason;
+    // Standard deviations from the final normal equations; infinite where nothing depends on an unknown. They know of
+    // noise, not of what the model lacks.
     double theta_std[DISNEY_N], centre_std_m[3], rotation_std_rad[3];
     double *inverse_distance_std;    // [groups] 1/m; owned
     double objective;                // mean squared residual of the fit

@@ -321,7 +321,7 @@ static void evaluate_texels(void *arg, int64_t begin, int64_t end, int worker, d
     struct job *j = arg;
     struct worker *w = &j->workers[worker];
     for (int texel = (int)begin; texel < (int)end; texel++) {
-        if (texel % j->p->texel_step)
+        if (texel % j->p->texel_step || (j->p->use_texel && !j->p->use_texel[texel]))
             continue;
         struct surface_point point;
         struct shade_material m;
@@ -468,7 +468,7 @@ static void add_texels(void *arg, int64_t begin, int64_t end, int worker, double
     float explained[n + 1];
     w->rows.A = partial, w->rows.g = partial + (size_t)n * (size_t)n;
     for (int texel = (int)begin; texel < (int)end; texel++) {
-        if (texel % j->p->texel_step)
+        if (texel % j->p->texel_step || (j->p->use_texel && !j->p->use_texel[texel]))
             continue;
         struct surface_point point;
         struct shade_material m;

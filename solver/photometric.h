@@ -33,6 +33,7 @@ struct photometric {
     int n_groups;
     const uint8_t *use_view;        // [n_views] 0: left out; NULL: all
     int texel_step;                 // only every so many texels (1: all): a coarse look costs less
+    const uint8_t *use_texel;       // [n_texels] 0: left out; NULL: all
     const float *weight;            // [samples n], or NULL: 1
     const uint16_t *visible;        // [n_texels][words], or NULL: everything
     int words_per_texel;
