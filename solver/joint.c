@@ -388,7 +388,6 @@ static int measure(const struct stage1 *s, const struct photometric_state *state
     p.use_view = use_view;
     p.use_texel = fitted;
     p.weight = NULL;
-    p.texel_step = 1;
     const int err = photometric_evaluate(&p, (struct photometric_state *)state, false, e);
     free(fitted);
     return err;
@@ -417,6 +416,16 @@ static int merge_lights(struct lights *out, const struct lights *fine, int run)
     return 0;
 }
 
+// Every so many texels, so that about n_samples are left; odd, so as not to fall in step with the texture's rows.
+static int step_for(const struct stage1 *s, int64_t n_samples)
+{
+    const int64_t step = s->p.samples->n / n_samples;
+    return step < 1 ? 1 : (int)step | 1;
+}
+// Few are enough to follow the valley, more to tell one weight from the next and for the last word; the albedo is then
+// solved for every texel.
+enum { SWEEP_SAMPLES = 12000, COARSE_SAMPLES = 30000, FINE_SAMPLES = 200000 };
+
 // The common distance of all lights, by brute trial at few texels: one group, so a Jacobian costs little.
 static int sweep(const struct photometric *p, const struct lights *lights, const struct rays *rays,
                  const struct joint_settings *set, struct photometric_state *best, double *best_cost, int *n_jacobians)
@@ -429,9 +438,8 @@ static int sweep(const struct photometric *p, const struct lights *lights, const
     *best_cost = INFINITY;
     coarse.group_of_light = one_group;
     coarse.n_groups = 1;
-    coarse.texel_step = p->texels->n > 1500 ? p->texels->n / 750 : 1;
-    if (coarse.texel_step > 1 && coarse.texel_step % 2 == 0)
-        coarse.texel_step++; // not in step with the texture's rows
+    const struct stage1 all = { .p = *p };
+    coarse.texel_step = step_for(&all, SWEEP_SAMPLES);
     const int n = set->start_distance_m > 0 ? 1 : (int)(sizeof(distances_m) / sizeof(distances_m[0]));
     for (int k = 0; !err && k < n; k++) {
         double cost;
@@ -463,7 +471,6 @@ static const double floor_percent = .03;
 static int continuation(struct stage1 *s, const uint8_t *aside)
 {
     enum { MAX_STEPS = 12 };
-    const int few = s->p.texels->n / 2000, coarse_step = few > 1 ? few + 1 - few % 2 : 1;
     const double last = s->set->w_sim >= 0 ? s->set->w_sim : 0;
     struct photometric_state at[MAX_STEPS] = { { .theta = { 0 } } };
     double error[MAX_STEPS], weight[MAX_STEPS], best = INFINITY;
@@ -472,12 +479,12 @@ static int continuation(struct stage1 *s, const uint8_t *aside)
     for (double w = 1e-4; !err && n < MAX_STEPS; w = w > 1e-13 ? w / 10 : 0) {
         struct photometric_error e;
         s->w_sim = weight[n] = w > last ? w : last;
-        s->p.texel_step = coarse_step;
+        s->p.texel_step = step_for(s, COARSE_SAMPLES);
         err = trace_visibility(s);
         if (!err)
             err = minimise(s, 6, 1e-2, NULL);
-        s->p.texel_step = 1;
-        if (!err) // the albedo of every texel, for the views set aside
+        s->p.texel_step = step_for(s, FINE_SAMPLES);
+        if (!err) // the albedo of more texels, for the views set aside
             err = photometric_evaluate(&s->p, &s->base, s->p.albedo == ALBEDO_FREE, &e);
         if (!err)
             err = measure(s, &s->base, aside, &e);
@@ -512,8 +519,9 @@ static int continuation(struct stage1 *s, const uint8_t *aside)
 static int refine(struct stage1 *s, const uint8_t *fit)
 {
     float *weight = NULL;
+    struct photometric_error e;
     s->p.use_view = fit;
-    s->p.texel_step = 1;
+    s->p.texel_step = step_for(s, FINE_SAMPLES);
     int err = trace_visibility(s);
     if (!err && s->set->robust) {
         double sigma;
@@ -526,6 +534,9 @@ static int refine(struct stage1 *s, const uint8_t *fit)
     if (!err)
         err = minimise(s, s->set->method == METHOD_JOINT ? 15 : 40, 1e-4, NULL);
     s->p.weight = NULL;
+    s->p.texel_step = 1;
+    if (!err)
+        err = photometric_evaluate(&s->p, &s->base, s->p.albedo == ALBEDO_FREE, &e);
     free(weight);
     return err;
 }
@@ -729,6 +740,7 @@ static int uncertainty(struct stage1 *s, struct joint_result *out)
     const double w_sim = s->w_sim;
     if (in_distance)
         s->w_sim = 0;
+    s->p.texel_step = step_for(s, FINE_SAMPLES);
     if (!err)
         err = normal_callback(s, s->x, &cost, A, g);
     s->in_distance = in_distance;
@@ -753,6 +765,7 @@ static int uncertainty(struct stage1 *s, struct joint_result *out)
         memcpy(out->rotation_std_rad, deviation + s->layout.rotation, sizeof(out->rotation_std_rad));
         memcpy(out->inverse_distance_std, deviation + s->layout.inverse_distance, (size_t)s->p.n_groups * sizeof(double));
     }
+    s->p.texel_step = 1;
     free(A);
     free(C);
     free(g);

@@ -38,7 +38,7 @@ enum {
 
 static const struct argp_option options[] = {
     { 0, 0, 0, 0, "Method", 2 },
-    { "preset", OPTION_PRESET, "NAME", 0, "preview (texture 64), standard (128, default) or final (256)", 2 },
+    { "preset", OPTION_PRESET, "NAME", 0, "preview (texture 128), standard (256, default) or final (512)", 2 },
     { "method", OPTION_METHOD, "NAME", 0, "joint (default), alternating (the paper) or directional", 2 },
     { "texture", OPTION_TEXTURE, "N", 0, "N x N texels", 2 },
     { "lights", OPTION_LIGHTS, "N", 0, "lights with a distance of their own, a power of two (256)", 2 },
@@ -386,7 +386,7 @@ int command_solve(int argc, char **argv)
     if (!s.n_sub)
         s.n_sub = s.joint.method == METHOD_JOINT ? 4 : 1;
     if (!s.texture)
-        s.texture = !strcmp(s.preset, "preview") ? 64 : !strcmp(s.preset, "final") ? 256 : 128;
+        s.texture = !strcmp(s.preset, "preview") ? 128 : !strcmp(s.preset, "final") ? 512 : 256;
     int err = load(&scene, &s);
     const double stage_begin = wall_s();
     if (!err)
