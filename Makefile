@@ -44,10 +44,10 @@ FUZZERS := cameras csv exr hdr json lights mesh
 
 # ---- rules --------------------------------------------------------------------------------------------------------------
 object = $(patsubst %.c,$(BUILD)/obj/%.o,$(1))
-ifneq ($(filter test demo bench chart stability,$(MAKECMDGOALS)),)
-FIRST := deps # these four install what is missing before the first file is compiled
+ifneq ($(filter test demo bench chart stability experiments,$(MAKECMDGOALS)),)
+FIRST := deps # these install what is missing before the first file is compiled
 endif
-.PHONY: all deps deps-fuzz deps-bench test demo bench chart stability fuzz check-includes man install clean help
+.PHONY: all deps deps-fuzz deps-bench test demo bench chart stability experiments fuzz check-includes man install clean help
 .DELETE_ON_ERROR:
 .SECONDARY:
 
@@ -121,6 +121,8 @@ $(BUILD)/tests/bench/bench_kernels: LIBS += $(if $(HAVE_CERES),-lstdc++)
 $(BUILD)/tests/bench/bench_kernels: $(if $(HAVE_CERES),$(BUILD)/obj/tests/bench/ceres_peer.o)
 bench: deps $(BENCH_PROGRAMS) $(BUILD)/bin/rigsolve
 	@for b in $(BENCHES); do echo "== bench_$$b"; $(BUILD)/tests/bench/bench_$$b || exit 1; done
+experiments: deps $(BUILD)/bin/rigsolve $(BUILD)/tests/bench/judge
+	@BIN=$(BUILD)/bin JUDGE=$(BUILD)/tests/bench/judge sh tests/bench/experiments.sh
 chart: deps deps-bench $(BUILD)/tests/bench/chart_lights
 	@mkdir -p build/chart && $(BUILD)/tests/bench/chart_lights >build/chart/lights.csv && gnuplot -e "out='build/chart/lights'" tests/bench/chart_lights.gp
 	@echo "chart: build/chart/lights.csv .svg .png: seconds against error over N, roughness and kernel"

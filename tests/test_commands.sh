@@ -46,7 +46,7 @@ gives 0 "help" "$rigsolve" --help
 gives 0 "version" "$rigsolve" --version
 gives 2 "no command is a usage error" "$rigsolve"
 gives 2 "an unknown command is a usage error" "$rigsolve" paint
-for c in brdf lights visibility synth render compare; do
+for c in brdf lights visibility synth solve render compare; do
     gives 0 "$c --help" "$rigsolve" $c --help
     gives 2 "$c without arguments is a usage error" "$rigsolve" $c
     gives 2 "$c with an unknown option is a usage error" "$rigsolve" $c --no-such-option
@@ -73,6 +73,22 @@ gives 0 "render of the truth by the take's cameras" "$rigsolve" render "$dir/one
 result $? "compare of two folders"
 json_has "$dir/compare.json" '$d->{rmse_percent} < .1 || print "RMSE $d->{rmse_percent} %\n"'
 result $? "the render of the truth is what synth wrote, to the rounding of half floats"
+
+gives 0 "synth makes a diffuse studio" "$rigsolve" synth D2 -o "$dir/diffuse" --size 120x80 --views 20 --true-lights 4096 --texture 64 --samples 1
+known="--reflectance lambert --albedo .5 --texture 32 --lights 64"
+gives 0 "solve finds the lights of a diffuse object of known albedo" "$rigsolve" solve "$dir/diffuse" -o "$dir/solve" $known --threads 1
+json_has "$dir/solve/report.json" '$d->{trusted} && $d->{rmse_held_out_percent} < .3 && @{$d->{warnings}} == 0 && $d->{method} eq "joint"'
+result $? "its report says so"
+perl -MJSON::PP -e 'my ($r, $p) = map { open(my $f, "<", $_) or die; local $/; decode_json(<$f>) } @ARGV;
+    my $d2 = 0; $d2 += ($r->{centre_m}[$_] - $p->{centre_m}[$_]) ** 2 for 0 .. 2; print "centre off by ", 100 * sqrt($d2), " cm\n"; exit($d2 < .05 ** 2 ? 0 : 1)' \
+    "$dir/solve/report.json" "$dir/diffuse/truth/probe.json" >"$dir/log" 2>&1
+result $? "the probe's place is found within 5 cm, from a start 44 cm away"
+gives 0 "solve again with other threads" "$rigsolve" solve "$dir/diffuse" -o "$dir/solve3" $known --threads 3
+cmp "$dir/solve/lights.json" "$dir/solve3/lights.json" >"$dir/log" 2>&1 && cmp "$dir/solve/albedo.exr" "$dir/solve3/albedo.exr" >>"$dir/log" 2>&1
+result $? "same lights and albedo, to the byte"
+gives 3 "a diffuse object of unknown albedo: solved as far as it goes, not to be trusted" "$rigsolve" solve "$dir/diffuse" -o "$dir/solve0" \
+    --reflectance lambert --texture 32 --lights 64
+gives 0 "render of what was solved" "$rigsolve" render "$dir/solve" --cameras "$dir/diffuse/geometry/cameras" -o "$dir/solved" --samples 1
 
 # Input as it comes from the world
 head -c 2000 "$dir/one/panorama.exr" >"$dir/cut.exr"
