@@ -267,15 +267,20 @@ static struct joint_settings all_parts(void)
 static void thread_count_does_not_change_a_byte(void **state)
 {
     (void)state;
-    struct joint_settings set[] = {all_parts(), settings_of(3, METHOD_ALTERNATING),
-                                   settings_of(3, METHOD_DIRECTIONAL)};
-    for (size_t i = 0; i < sizeof(set) / sizeof(set[0]); i++) {
+    struct {
+        int data_set;
+        struct joint_settings settings;
+    } solves[] = {{3, all_parts()},
+                  {2, settings_of(2, METHOD_ALTERNATING)},
+                  {3, settings_of(3, METHOD_DIRECTIONAL)}};
+    for (size_t i = 0; i < sizeof(solves) / sizeof(solves[0]); i++) {
+        const struct studio *s = studio_of(solves[i].data_set);
         struct joint_result one, three;
-        set[i].n_threads = 1;
-        assert_int_equal(solve(&one, studio_of(3), &set[i]), 0);
-        set[i].n_threads = 3;
-        assert_int_equal(solve(&three, studio_of(3), &set[i]), 0);
-        assert_same_state(studio_of(3), &one.state, &three.state);
+        solves[i].settings.n_threads = 1;
+        assert_int_equal(solve(&one, s, &solves[i].settings), 0);
+        solves[i].settings.n_threads = 3;
+        assert_int_equal(solve(&three, s, &solves[i].settings), 0);
+        assert_same_state(s, &one.state, &three.state);
         assert_memory_equal(one.inverse_distance_std, three.inverse_distance_std,
                             N_LIGHTS * sizeof(double));
         assert_true(one.rmse_held_out_percent == three.rmse_held_out_percent);
