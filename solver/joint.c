@@ -428,7 +428,7 @@ enum { SWEEP_SAMPLES = 12000, COARSE_SAMPLES = 30000, FINE_SAMPLES = 200000 };
 
 // The common distance of all lights, by brute trial at few texels: one group, so a Jacobian costs little.
 static int sweep(const struct photometric *p, const struct lights *lights, const struct rays *rays,
-                 const struct joint_settings *set, struct photometric_state *best, double *best_cost, int *n_jacobians)
+                 const struct joint_settings *set, struct photometric_state *best, double *best_cost, struct stage1 *total)
 {
     static const double distances_m[] = { .7, 1.1, 1.7, 2.6, 4 };
     int32_t *one_group = calloc((size_t)lights->n, sizeof(*one_group));
@@ -455,7 +455,7 @@ static int sweep(const struct photometric *p, const struct lights *lights, const
             *best_cost = cost;
             photometric_state_copy(&coarse, best, &s.base);
         }
-        *n_jacobians += s.n_jacobians;
+        total->n_jacobians += s.n_jacobians, total->n_evaluations += s.n_evaluations;
         stage1_free(&s);
     }
     free(one_group);
@@ -569,14 +569,14 @@ static int solve_joint(struct stage1 *s, const struct photometric *p, const stru
         group[i] = i;
     err = photometric_state_new(&start, &coarse, &one);
     if (!err)
-        err = sweep(&coarse, &one, s->rays, s->set, &start, &cost, &s->n_jacobians);
+        err = sweep(&coarse, &one, s->rays, s->set, &start, &cost, s);
     if (!err) { // is the panorama mirrored?
         struct photometric_state unused = { 0 };
         for (int i = 0; i < one.n; i++)
             one.dir_probe[i][0] *= -1;
         err = photometric_state_new(&unused, &coarse, &one);
         if (!err)
-            err = sweep(&coarse, &one, s->rays, s->set, &unused, &mirrored_cost, &s->n_jacobians);
+            err = sweep(&coarse, &one, s->rays, s->set, &unused, &mirrored_cost, s);
         photometric_state_free(&unused);
         if (!err && mirrored_cost < .5 * cost)
             out->doubts |= DOUBT_MIRRORED;
@@ -787,7 +787,7 @@ static void doubt(const struct stage1 *s, struct joint_result *out, int n_fit_vi
     double relative[s->p.n_groups];
     int n = 0;
     for (int g = 0; g < s->p.n_groups; g++)
-        for (int i = 0; i < s->base.lights.n; i++)
+        for (int i = 0; s->is_free[s->layout.inverse_distance + g] && i < s->base.lights.n; i++) // not those without light
             if (s->p.group_of_light[i] == g) {
                 relative[n++] = out->inverse_distance_std[g] / s->base.lights.inverse_distance[i];
                 break;
@@ -864,7 +864,8 @@ int joint_solve(struct joint_result *out, const struct texels *texels, const str
         out->n_jacobians = s.n_jacobians;
         out->n_evaluations = s.n_evaluations;
         out->w_sim = s.w_sim;
-        out->w_sim_sum = s.w_sim * s.n_residuals;
+        // the paper's is of the bright samples
+        out->w_sim_sum = set->method == METHOD_ALTERNATING ? set->w_sim : s.w_sim * s.n_residuals;
         out->stop_reason = s.stop ? s.stop : "";
         out->state = s.base;
         memset(&s.base, 0, sizeof(s.base));
