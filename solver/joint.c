@@ -41,6 +41,8 @@ const char *joint_doubt_text(unsigned one_bit)
 
 enum { N_NEIGHBOURS = 8 };
 static const double least_q = .02, most_q = 5; // 50 m .. 20 cm
+static const double centre_guess_m = .3;       // how well the centre of the panorama is known at the start
+static const double first_w_sim = 1e-3;        // of the continuation, and of the sweep
 
 struct pair {
     int i, j;
@@ -56,6 +58,7 @@ struct stage1 {
     struct pair *pairs;
     bool in_distance;      // the unknown is r, not 1/r, and E_sim is Eq. 11 to the letter (paper)
     double w_sim;          // beside the mean of squares
+    double first_centre_m[3]; // joint: the centre is held near its first guess with the same weight, which ends at (nearly) 0
     double n_residuals;    // samples x 3 in use
     unsigned char *is_free;
     double *x, *lower, *upper;
@@ -119,6 +122,7 @@ static double similarity_of(const struct stage1 *s, double x, double *slope)
     return log(x);
 }
 
+// Eq. 11, and for joint the first guess of the centre.
 static double add_similarity(const struct stage1 *s, const double *x, double *A, double *g)
 {
     const int first = s->layout.inverse_distance, n = s->layout.n;
@@ -134,6 +138,13 @@ static double add_similarity(const struct stage1 *s, const double *x, double *A,
         g[i] += w * e * si, g[j] -= w * e * sj;
         A[(size_t)i * n + i] += w * si * si, A[(size_t)j * n + j] += w * sj * sj;
         A[(size_t)(i > j ? i : j) * n + (i > j ? j : i)] -= w * si * sj;
+    }
+    for (int c = 0; s->set->method == METHOD_JOINT && c < 3; c++) {
+        const int i = s->layout.centre + c;
+        const double w = s->w_sim / (centre_guess_m * centre_guess_m), e = x[i] - s->first_centre_m[c];
+        cost += .5 * w * e * e;
+        if (A)
+            A[(size_t)i * n + i] += w, g[i] += w * e;
     }
     return cost;
 }
@@ -328,6 +339,7 @@ static int stage1_new(struct stage1 *s, const struct photometric *p, const struc
     s->set = set, s->p = *p, s->rays = rays;
     s->layout = photometric_layout_of(p->samples->n_views, p->n_groups);
     s->in_distance = set->method == METHOD_ALTERNATING;
+    memcpy(s->first_centre_m, lights->centre_m, sizeof(s->first_centre_m));
     const size_t n = (size_t)s->layout.n;
     s->is_free = calloc(n, 1);
     s->x = calloc(n, sizeof(double));
@@ -424,7 +436,7 @@ static int step_for(const struct stage1 *s, int64_t n_samples)
 }
 // Few are enough to follow the valley, more to tell one weight from the next and for the last word; the albedo is then
 // solved for every texel.
-enum { SWEEP_SAMPLES = 12000, COARSE_SAMPLES = 30000, FINE_SAMPLES = 200000 };
+enum { SWEEP_SAMPLES = 30000, COARSE_SAMPLES = 30000, FINE_SAMPLES = 200000 };
 
 // The common distance of all lights, by brute trial at few texels: one group, so a Jacobian costs little.
 static int sweep(const struct photometric *p, const struct lights *lights, const struct rays *rays,
@@ -449,6 +461,7 @@ static int sweep(const struct photometric *p, const struct lights *lights, const
             err = trace_visibility(&s);
         }
         if (!err) {
+            s.w_sim = first_w_sim;
             err = minimise(&s, 12, 1e-4, &cost);
         }
         if (!err && cost < *best_cost) {
@@ -470,19 +483,19 @@ static const double floor_percent = .03;
 // for nothing.
 static int continuation(struct stage1 *s, const uint8_t *aside)
 {
-    enum { MAX_STEPS = 12 };
+    enum { MAX_STEPS = 13 };
     const double last = s->set->w_sim >= 0 ? s->set->w_sim : 0;
     struct photometric_state at[MAX_STEPS] = { { .theta = { 0 } } };
     double error[MAX_STEPS], weight[MAX_STEPS], best = INFINITY;
     int n = 0, n_worse = 0, chosen = 0, err = 0;
     progress_begin("joint", MAX_STEPS);
-    for (double w = 1e-4; !err && n < MAX_STEPS; w = w > 1e-13 ? w / 10 : 0) {
+    for (double w = first_w_sim; !err && n < MAX_STEPS; w = w > 1e-13 ? w / 10 : 0) {
         struct photometric_error e;
         s->w_sim = weight[n] = w > last ? w : last;
         s->p.texel_step = step_for(s, COARSE_SAMPLES);
         err = trace_visibility(s);
         if (!err)
-            err = minimise(s, 6, 1e-2, NULL);
+            err = minimise(s, 8, 2e-3, NULL);
         s->p.texel_step = step_for(s, FINE_SAMPLES);
         if (!err) // the albedo of more texels, for the views set aside
             err = photometric_evaluate(&s->p, &s->base, s->p.albedo == ALBEDO_FREE, &e);
@@ -498,7 +511,7 @@ static int continuation(struct stage1 *s, const uint8_t *aside)
         log_debug("joint: w_sim %.0e: views set aside %.4f %%", w, error[n]);
         n_worse = error[n] < .97 * best ? 0 : n_worse + 1;
         best = fmin(best, error[n++]);
-        if (w <= last || (s->set->w_sim < 0 && n_worse == 3))
+        if (w <= last || (s->set->w_sim < 0 && w < 1e-8 && n_worse >= 3))
             break;
     }
     if (!err) {
