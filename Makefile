@@ -26,8 +26,8 @@ CFLAGS_ALL = -std=gnu11 -D_GNU_SOURCE $(FLAGS_$(VARIANT)) -Wall -Wextra -Wshadow
 EMBREE = $(shell test -e /usr/include/embree4/rtcore.h && echo embree4 || echo embree3)
 LIBS = -lOpenEXRCore -l$(EMBREE) -lassimp -ljansson -ltiff -lpng -llapacke -lopenblas -lm
 ifeq ($(MACHINE),x86_64)
-ISA_avx2 := -mavx2 -mfma
-ISA_avx512 := -mavx512f -mavx512dq -mavx512bw -mavx512vl -mfma -mprefer-vector-width=512
+ISA_avx2 := -mavx2 -mfma -ffp-contract=fast
+ISA_avx512 := -mavx512f -mavx512dq -mavx512bw -mavx512vl -mfma -mprefer-vector-width=512 -ffp-contract=fast
 endif
 
 # ---- what is built ------------------------------------------------------------------------------------------------------
