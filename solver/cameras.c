@@ -69,50 +69,50 @@ static bool is_monotonic(const struct camera *c, double s) // s: r^2, fisheye: a
     return polynomial_is_positive(d, 3, s) && polynomial_is_positive(slope, MAX_DEGREE, s);
 }
 
+static bool has_tangential(const struct camera *c)
+{
+    return c->p[0] != 0 || c->p[1] != 0;
+}
+
 static bool is_undistorted(const struct camera *c)
 {
     for (int i = 0; i < 6; i++)
         if (c->k[i] != 0)
             return false;
-    return c->model != CAMERA_FISHEYE && c->p[0] == 0 && c->p[1] == 0;
+    return c->model != CAMERA_FISHEYE && !has_tangential(c);
 }
 
-// d[2] = distorted (x, y), D = its 2x2 derivative. False beyond the monotonic range.
-static bool distort(const struct camera *c, double x, double y, double d[2], double D[4])
+// From (X/Z, Y/Z) to the same direction with the angle, not its tangent, as radius; A: the (symmetric) 2x2 derivative.
+static void to_angles(double x, double y, double a[2], double A[4])
+{
+    const double s = x * x + y * y, r = sqrt(s);
+    double f = 1 - s / 3, f_s = -1. / 3; // series: atan r = r - r^3 / 3
+    if (r >= 1e-4)
+        f = atan(r) / r, f_s = (1 / (1 + s) - f) / (2 * s);
+    a[0] = x * f, a[1] = y * f;
+    A[0] = f + 2 * x * x * f_s, A[1] = A[2] = 2 * x * y * f_s, A[3] = f + 2 * y * y * f_s;
+}
+
+// The polynomial part, in tangents (fisheye: in angles). d[2] = distorted (x, y), D = its 2x2 derivative. False beyond the
+// monotonic range.
+static bool distort_plane(const struct camera *c, double x, double y, double d[2], double D[4])
 {
     const double *k = c->k, *p = c->p;
     const double s = x * x + y * y;
     double f, f_s; // radial factor, and its derivative by s = r^2
-    if (is_undistorted(c)) {
-        d[0] = x, d[1] = y;
-        D[0] = D[3] = 1, D[1] = D[2] = 0;
-        return true;
-    }
-    if (c->model == CAMERA_FISHEYE) {
-        const double r = sqrt(s), a = atan(r), a2 = a * a;
-        const double ad = a * (1 + a2 * (k[0] + a2 * (k[1] + a2 * (k[2] + a2 * k[3]))));
-        const double slope = 1 + a2 * (3 * k[0] + a2 * (5 * k[1] + a2 * (7 * k[2] + a2 * 9 * k[3])));
-        if (!is_monotonic(c, a2))
-            return false;
-        if (r < 1e-4) // series: a = r - r^3 / 3
-            f = 1 + (k[0] - 1. / 3) * s, f_s = k[0] - 1. / 3;
-        else
-            f = ad / r, f_s = (slope / (1 + s) - f) / (2 * s);
+    if (!is_monotonic(c, s))
+        return false;
+    if (c->model == CAMERA_RATIONAL) {
+        const double n = 1 + s * (k[0] + s * (k[1] + s * k[2])), m = 1 + s * (k[3] + s * (k[4] + s * k[5]));
+        const double n_s = k[0] + s * (2 * k[1] + s * 3 * k[2]), m_s = k[3] + s * (2 * k[4] + s * 3 * k[5]);
+        f = n / m, f_s = (n_s - f * m_s) / m;
     } else {
-        if (!is_monotonic(c, s))
-            return false;
-        if (c->model == CAMERA_BROWN) {
-            f = 1 + s * (k[0] + s * (k[1] + s * (k[2] + s * k[3])));
-            f_s = k[0] + s * (2 * k[1] + s * (3 * k[2] + s * 4 * k[3]));
-        } else {
-            const double n = 1 + s * (k[0] + s * (k[1] + s * k[2])), m = 1 + s * (k[3] + s * (k[4] + s * k[5]));
-            const double n_s = k[0] + s * (2 * k[1] + s * 3 * k[2]), m_s = k[3] + s * (2 * k[4] + s * 3 * k[5]);
-            f = n / m, f_s = (n_s - f * m_s) / m;
-        }
+        f = 1 + s * (k[0] + s * (k[1] + s * (k[2] + s * k[3])));
+        f_s = k[0] + s * (2 * k[1] + s * (3 * k[2] + s * 4 * k[3]));
     }
     d[0] = x * f, d[1] = y * f;
     D[0] = f + 2 * x * x * f_s, D[1] = D[2] = 2 * x * y * f_s, D[3] = f + 2 * y * y * f_s;
-    if (c->model != CAMERA_FISHEYE && (p[0] != 0 || p[1] != 0)) {
+    if (has_tangential(c)) {
         const double tx = 2 * p[0] * x * y + p[1] * (s + 2 * x * x), ty = 2 * p[1] * x * y + p[0] * (s + 2 * y * y);
         const double g = 1 + s * (p[2] + s * p[3]), g_s = p[2] + 2 * s * p[3];
         d[0] += tx * g, d[1] += ty * g;
@@ -124,11 +124,29 @@ static bool distort(const struct camera *c, double x, double y, double d[2], dou
     return isfinite(d[0]) && isfinite(d[1]);
 }
 
-// Newton with halved steps where a full one does not help. False: no solution near.
+static bool distort(const struct camera *c, double x, double y, double d[2], double D[4])
+{
+    double a[2], A[4], B[4];
+    if (is_undistorted(c)) {
+        d[0] = x, d[1] = y;
+        D[0] = D[3] = 1, D[1] = D[2] = 0;
+        return true;
+    }
+    if (c->model != CAMERA_FISHEYE)
+        return distort_plane(c, x, y, d, D);
+    to_angles(x, y, a, A);
+    if (!distort_plane(c, a[0], a[1], d, B))
+        return false;
+    D[0] = B[0] * A[0] + B[1] * A[2], D[1] = B[0] * A[1] + B[1] * A[3];
+    D[2] = B[2] * A[0] + B[3] * A[2], D[3] = B[2] * A[1] + B[3] * A[3];
+    return true;
+}
+
+// The inverse of distort_plane: Newton, with halved steps where a full one does not help. False: no solution near.
 static bool undistort_newton(const struct camera *c, const double d[2], double xy[2])
 {
     double x = d[0], y = d[1], e[2], D[4];
-    while (!distort(c, x, y, e, D)) { // start inside the model's range
+    while (!distort_plane(c, x, y, e, D)) { // start inside the model's range
         x *= .5, y *= .5;
         if (fabs(x) + fabs(y) < 1e-12)
             return false;
@@ -146,7 +164,7 @@ static bool undistort_newton(const struct camera *c, const double d[2], double x
         for (;; step *= .5) {
             if (step < 1e-6) // as good as it gets
                 goto done;
-            if (!distort(c, x + step * sx, y + step * sy, e, D))
+            if (!distort_plane(c, x + step * sx, y + step * sy, e, D))
                 continue;
             if (hypot(e[0] - d[0], e[1] - d[1]) < before)
                 break;
@@ -245,13 +263,17 @@ bool camera_ray(const struct camera *c, const double uv_px[2], double dir_world[
     if (!isfinite(d[0]) || !isfinite(d[1]))
         return false;
     if (c->model == CAMERA_FISHEYE) {
-        const double ad = hypot(d[0], d[1]);
         double a;
-        if (!fisheye_angle(c, ad, &a))
+        if (has_tangential(c)) {
+            if (!undistort_newton(c, d, d))
+                return false;
+            a = hypot(d[0], d[1]);
+        } else if (!fisheye_angle(c, hypot(d[0], d[1]), &a)) {
             return false;
-        const double sine_per_ad = ad > 1e-12 ? sin(a) / ad : 1;
-        q[0] = d[0] * sine_per_ad, q[1] = d[1] * sine_per_ad, q[2] = cos(a);
-        if (!(q[2] > 0))
+        }
+        const double length = hypot(d[0], d[1]), sine = length > 1e-12 ? sin(a) / length : 1;
+        q[0] = d[0] * sine, q[1] = d[1] * sine, q[2] = cos(a);
+        if (!(a < M_PI_2 && q[2] > 0))
             return false;
     } else if (is_undistorted(c)) {
         q[0] = d[0], q[1] = d[1], q[2] = 1;

@@ -5,7 +5,8 @@
 //   BROWN    s = 1 + k1 r2 + k2 r4 + k3 r6 + k4 r8;  xd = x s + (2 p1 x y + p2 (r2 + 2 x^2)) (1 + p3 r2 + p4 r4), yd likewise
 //            (OpenCV's p1, p2 order; no distortion: all zero)
 //   RATIONAL s = (1 + k1 r2 + k2 r4 + k3 r6) / (1 + k4 r2 + k5 r4 + k6 r6); tangential as BROWN
-//   FISHEYE  a = atan2(r, z); ad = a (1 + k1 a^2 + k2 a^4 + k3 a^6 + k4 a^8); (xd, yd) = (x, y) ad / r
+//   FISHEYE  (xa, ya) = (x, y) atan(r) / r, then BROWN on (xa, ya): a = atan r, ad = a (1 + k1 a^2 + ... + k4 a^8), tangential
+//            terms in (xa, ya) (Metashape's; zero in OpenCV's)
 // u = fx xd + skew yd + cx, v = fy yd + cy.
 #pragma once
 #include <stdbool.h>

@@ -53,7 +53,7 @@ static void random_point(double out[3], uint64_t i)
 }
 
 // A view of the origin from about 2 m, looking a little past it. kind: which distortion.
-enum { N_KINDS = 9 };
+enum { N_KINDS = 10 };
 static struct camera make_view(int kind, uint64_t seed)
 {
     struct camera c = { .width_px = 6000, .height_px = 4000, .fx = 7213.25, .fy = 7201.5, .cx = 3011.125, .cy = 1984.5 };
@@ -79,6 +79,7 @@ static struct camera make_view(int kind, uint64_t seed)
         { CAMERA_FISHEYE, { -.03, .012, -.004, .001 }, { 0 }, 0 },
         { CAMERA_BROWN, { -.1, .05, -.01, .003 }, { .0007, -.0004, .02, -.01 }, 3.5 }, // from here on, COLMAP has no model
         { CAMERA_RATIONAL, { .31, -.12, .05, .28, -.06, .02 }, { .0005, .0002, .03, .01 }, 1 },
+        { CAMERA_FISHEYE, { -.03, .012, -.004, .001 }, { .0004, -.0006, .02, -.03 }, 2 },
     };
     c.model = kinds[kind].model, c.skew = kinds[kind].skew;
     memcpy(c.k, kinds[kind].k, sizeof(c.k));
@@ -166,7 +167,9 @@ static void distortion_is_what_the_header_says(void **state)
             if (c.model == CAMERA_FISHEYE) {
                 const double a = atan2(r, 1);
                 const double ad = a * (1 + k[0] * pow(a, 2) + k[1] * pow(a, 4) + k[2] * pow(a, 6) + k[3] * pow(a, 8));
-                xd = x * ad / r, yd = y * ad / r;
+                const double xa = x * a / r, ya = y * a / r, g = 1 + t[2] * pow(a, 2) + t[3] * pow(a, 4);
+                xd = x * ad / r + (2 * t[0] * xa * ya + t[1] * (a * a + 2 * xa * xa)) * g;
+                yd = y * ad / r + (2 * t[1] * xa * ya + t[0] * (a * a + 2 * ya * ya)) * g;
             } else {
                 const double above = 1 + k[0] * pow(r, 2) + k[1] * pow(r, 4) + k[2] * pow(r, 6);
                 const double s = c.model == CAMERA_BROWN ? above + k[3] * pow(r, 8)
@@ -326,7 +329,7 @@ static void what_colmap_cannot_hold_is_refused_by_view(void **state)
         assert_non_null(strstr(logged, views[1].name));
         views[1].skew = 0;
         assert_int_equal(cameras_write_colmap_binary(&c, scratch_dir), -ENOTSUP);
-        assert_non_null(strstr(logged, kind == 7 ? "k4" : "p3"));
+        assert_non_null(strstr(logged, kind == 7 ? "k4" : kind == 8 ? "p3" : "p1"));
     }
     struct dirent **entries;
     const int n = scandir(scratch_dir, &entries, NULL, NULL); // nothing was written
