@@ -9,7 +9,6 @@
 #include <stdio.h>
 #include <stdlib.h>
 #include <string.h>
-#include <strings.h>
 #include <sys/stat.h>
 
 static const double min_depth = 1e-9;
@@ -336,137 +335,119 @@ void cameras_free(struct cameras *c)
     memset(c, 0, sizeof(*c));
 }
 
-int camera_set_name(struct camera *c, const char *file, size_t n_file)
+// ---- which reader -------------------------------------------------------------------------------------------------------
+
+// COLMAP comes first: in a folder, its files win over sidecars lying beside them.
+static const struct cameras_format {
+    const char *name;
+    bool (*probe)(const struct cameras_source *s);
+    int (*read)(struct cameras *out, const struct cameras_source *s);
+} formats[] = {
+    { "COLMAP", cameras_colmap_probe, cameras_colmap_read },
+    { "Bundler", cameras_bundler_probe, cameras_bundler_read },
+    { "Agisoft Metashape XML", cameras_metashape_probe, cameras_metashape_read },
+    { "RealityCapture", cameras_realitycapture_probe, cameras_realitycapture_read },
+    { "Meshroom (AliceVision SfMData JSON)", cameras_meshroom_probe, cameras_meshroom_read },
+};
+
+static const struct cameras_format *format_of(const struct cameras_source *s)
 {
-    const char *slash = memrchr(file, '/', n_file);
-    if (slash)
-        n_file -= (size_t)(slash + 1 - file), file = slash + 1;
-    const char *dot = memrchr(file, '.', n_file);
-    if (dot && dot > file)
-        n_file = (size_t)(dot - file);
-    if (n_file == 0 || n_file >= sizeof(c->name))
-        return -EINVAL;
-    for (size_t i = 0; i < n_file; i++)
-        if ((unsigned char)file[i] < ' ' || file[i] == 0x7f)
-            return -EINVAL;
-    memcpy(c->name, file, n_file);
-    c->name[n_file] = 0;
+    for (size_t i = 0; i < sizeof(formats) / sizeof(formats[0]); i++)
+        if (formats[i].probe(s))
+            return &formats[i];
+    return NULL;
+}
+
+// A file's first bytes. 0 or -errno (not logged).
+static int look_at(struct cameras_source *s, char *head, size_t n_head)
+{
+    struct stat st;
+    head[0] = 0;
+    s->head = head, s->n_head = 0;
+    if (stat(s->path, &st))
+        return -errno;
+    s->is_folder = S_ISDIR(st.st_mode);
+    if (s->is_folder)
+        return 0;
+    FILE *f = S_ISREG(st.st_mode) ? fopen(s->path, "rbe") : NULL;
+    if (!f)
+        return S_ISREG(st.st_mode) ? -errno : -EINVAL;
+    s->n_head = fread(head, 1, n_head - 1, f);
+    head[s->n_head] = 0;
+    fclose(f);
     return 0;
 }
 
-static int compare_names(const void *a, const void *b)
-{
-    const struct camera *const *x = a, *const *y = b;
-    return strcmp((*x)->name, (*y)->name);
-}
+static const char expected[] = "COLMAP's cameras and images (.bin or .txt), a Bundler bundle.out, a Metashape XML, RealityCapture "
+                               "XMP sidecars or CSV, or Meshroom's sfm JSON";
 
-int cameras_check_names(const struct cameras *c, const char *path)
+// The one file in a folder that is of a known format.
+static int read_from_folder(struct cameras *out, const struct cameras_source *folder)
 {
-    int err = 0;
-    const struct camera **sorted = malloc((size_t)c->n * sizeof(*sorted));
-    if (!sorted)
-        return -ENOMEM;
-    for (int i = 0; i < c->n; i++)
-        sorted[i] = &c->view[i];
-    qsort(sorted, (size_t)c->n, sizeof(*sorted), compare_names);
-    for (int i = 1; i < c->n && !err; i++)
-        if (!strcmp(sorted[i - 1]->name, sorted[i]->name)) {
-            log_error("cameras: %s: two images are called '%s' (folder and extension apart); rename one: views are known "
-                      "by that name", path, sorted[i]->name);
+    struct dirent **entries = NULL;
+    char *found = NULL;
+    const struct cameras_format *format = NULL;
+    int n = scandir(folder->path, &entries, NULL, cameras_by_name), err = n < 0 ? -errno : 0;
+    if (err)
+        log_error("cameras: cannot list %s: %s", folder->path, strerror(-err));
+    for (int i = 0; i < n; i++) {
+        char *path = NULL, head[4096];
+        struct cameras_source s = *folder;
+        const struct cameras_format *is = NULL;
+        if (!err && entries[i]->d_name[0] != '.' && asprintf(&path, "%s/%s", folder->path, entries[i]->d_name) >= 0) {
+            s.path = path, s.is_listed = true;
+            if (!look_at(&s, head, sizeof(head)) && !s.is_folder)
+                is = format_of(&s);
+        }
+        free(entries[i]);
+        if (is && found) {
+            log_error("cameras: %s holds both %s (%s) and %s (%s); leave one of them, or name it", folder->path, found, format->name,
+                      path, is->name);
             err = -EINVAL;
         }
-    free(sorted);
+        if (is && !found)
+            found = path, format = is;
+        else
+            free(path);
+    }
+    free(entries);
+    if (!err && !found) {
+        log_error("cameras: %s: no cameras in this folder; expected %s", folder->path, expected);
+        err = -EINVAL;
+    }
+    if (!err) {
+        char head[4096];
+        struct cameras_source s = *folder;
+        s.path = found;
+        err = look_at(&s, head, sizeof(head));
+        if (!err)
+            err = format->read(out, &s);
+    }
+    free(found);
     return err;
 }
 
-// ---- which reader -------------------------------------------------------------------------------------------------------
-
-static bool starts_with(const char *text, const char *prefix)
+int cameras_read_with(struct cameras *out, const char *path, const struct cameras_options *options)
 {
-    return !strncmp(text, prefix, strlen(prefix));
-}
-
-static bool is_bundler(const struct cameras_source *s)
-{
-    return starts_with(s->head, "# Bundle file");
-}
-
-static bool is_metashape(const struct cameras_source *s)
-{
-    return strstr(s->head, "<document") && s->head[strspn(s->head, " \t\r\n\xef\xbb\xbf")] == '<';
-}
-
-static bool has_xmp_sidecars(const char *folder)
-{
-    DIR *dir = opendir(folder);
-    bool found = false;
-    for (struct dirent *e = dir ? readdir(dir) : NULL; e && !found; e = readdir(dir)) {
-        const size_t n = strlen(e->d_name);
-        found = n > 4 && !strcasecmp(e->d_name + n - 4, ".xmp");
-    }
-    if (dir)
-        closedir(dir);
-    return found;
-}
-
-static bool is_reality_capture(const struct cameras_source *s)
-{
-    return s->is_folder ? has_xmp_sidecars(s->path)
-                        : strstr(s->head, "x:xmpmeta") || strstr(s->head, "capturingreality.com");
-}
-
-static bool is_meshroom(const struct cameras_source *s)
-{
-    return s->head[strspn(s->head, " \t\r\n\xef\xbb\xbf")] == '{' &&
-           (strstr(s->head, "\"views\"") || strstr(s->head, "\"featuresFolders\"") ||
-            strstr(s->head, "\"intrinsics\""));
-}
-
-// COLMAP comes first: in a folder, its files win over sidecars lying beside them.
-static const struct cameras_format formats[] = {
-    { "COLMAP", cameras_colmap_probe, cameras_colmap_read },
-    { "Bundler bundle.out", is_bundler, NULL },
-    { "Agisoft Metashape cameras XML", is_metashape, NULL },
-    { "RealityCapture XMP", is_reality_capture, NULL },
-    { "Meshroom (AliceVision SfMData JSON)", is_meshroom, NULL },
-};
-
-int cameras_read(struct cameras *out, const char *path)
-{
-    char head[4096] = "";
-    struct stat st;
-    struct cameras_source s = { .path = path, .head = head };
+    char head[4096];
+    static const struct cameras_options nothing;
+    struct cameras_source s = { .path = path, .options = options ? options : &nothing };
     memset(out, 0, sizeof(*out));
-    FILE *f = NULL;
-    int err = stat(path, &st) ? -errno : 0;
-    s.is_folder = !err && S_ISDIR(st.st_mode);
-    if (!err && !s.is_folder) {
-        f = S_ISREG(st.st_mode) ? fopen(path, "rbe") : NULL;
-        err = f ? 0 : S_ISREG(st.st_mode) ? -errno : -EINVAL;
-    }
+    const int err = look_at(&s, head, sizeof(head));
     if (err) {
         log_error("cameras: cannot open %s: %s", path, strerror(-err));
         return err;
     }
-    if (f) {
-        s.n_head = fread(head, 1, sizeof(head) - 1, f);
-        head[s.n_head] = 0;
-        fclose(f);
-    }
-    for (size_t i = 0; i < sizeof(formats) / sizeof(formats[0]); i++) {
-        if (!formats[i].probe(&s))
-            continue;
-        if (formats[i].read)
-            return formats[i].read(out, &s);
-        log_error("cameras: %s: this is %s, which is not read yet; export the cameras in COLMAP format "
-                  "(cameras.txt and images.txt)", path, formats[i].name);
-        return -ENOTSUP;
-    }
+    const struct cameras_format *format = format_of(&s);
+    if (format)
+        return format->read(out, &s);
     if (s.is_folder)
-        log_error("cameras: %s: no cameras in this folder; expected COLMAP's cameras.bin and images.bin, or cameras.txt and "
-                  "images.txt", path);
-    else
-        log_error("cameras: %s: not a known camera file; expected a folder with COLMAP's cameras and images, .bin or "
-                  ".txt", path);
+        return read_from_folder(out, &s);
+    log_error("cameras: %s: not a known camera file; expected %s", path, expected);
     return -EINVAL;
+}
+
+int cameras_read(struct cameras *out, const char *path)
+{
+    return cameras_read_with(out, path, NULL);
 }
