@@ -675,7 +675,7 @@ static void headers_of_pictures_tell_their_size(void **state)
         { "tiff", "II*\0\x08\0\0\0\x02\0\0\x01\x03\0\x01\0\0\0\x10\0\0\0\x01\x01\x04\0\x01\0\0\0\x20\0\0\0", 34, 16, 32 },
         { "big-endian tiff", "MM\0*\0\0\0\x08\0\x02\x01\0\0\x03\0\0\0\x01\0\x10\0\0\x01\x01\0\x04\0\0\0\x01\0\0\0\x20", 34, 16, 32 },
         { "tiff with its directory beyond the end", "II*\0\xff\xff\xff\x7f\x02\0\0\x01\x03\0\x01\0\0\0\x10\0", 20, 0, 0 },
-        { "hdr", "#?RADIANCE\nFORMAT=32-bit_rle_rgbe\n\n-Y 12 +X 34\n", 49, 34, 12 },
+        { "hdr", "#?RADIANCE\nFORMAT=32-bit_rle_rgbe\n\n-Y 12 +X 34\n", 47, 34, 12 },
         { "text", "hello, world", 12, 0, 0 },
         { "nothing", "", 0, 0, 0 },
     };
