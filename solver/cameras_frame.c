@@ -1,5 +1,6 @@
 // solver/cameras_frame.c - cameras and mesh in one frame, or a refusal that says what is wrong.
 #include "solver/cameras_frame.h"
+#include "solver/take/image.h"
 #include "solver/take/log.h"
 #include "solver/vec3.h"
 
@@ -8,7 +9,7 @@
 #include <stdlib.h>
 #include <string.h>
 
-enum { MAX_VERTICES = 1000, MAX_VIEWS = 100, N_TURNS = 3, N_MIRRORS = 3 };
+enum { MAX_VERTICES = 1000, MAX_VIEWS = 100, N_TURNS = 3, N_MIRRORS = 3, N_POINTS = 500, MAX_PICTURES = 8 };
 
 // In order: as it is; turns (a rotation: may be applied); mirrors; scales.
 static const struct cameras_trial all_trials[CAMERAS_N_TRIALS] = {
@@ -185,5 +186,128 @@ int cameras_read_for_mesh(struct cameras *out, const char *path, const struct ca
         return err;
     }
     *out = with;
+    return 0;
+}
+
+// ---- what the pictures say ----------------------------------------------------------------------------------------------
+
+// log brightness of each point in each picture under each trial; NAN: not seen
+typedef float brightness[CAMERAS_N_AGREEMENTS][N_POINTS][MAX_PICTURES];
+
+static void look(brightness value, int k, const struct camera *camera, const struct image *image, const struct mesh *mesh,
+                 const struct rays *rays)
+{
+    int rgb[3];
+    for (int c = 0; c < 3; c++) {
+        static const char *const names[3] = { "R", "G", "B" };
+        rgb[c] = image_channel(image, names[c]);
+    }
+    for (int trial = 0; trial < CAMERAS_N_AGREEMENTS; trial++) {
+        const double *turn = all_trials[trial].mesh;
+        double eye[3]; // among the mesh as it is
+        mat3_tmul_vec(eye, turn, camera->centre_m);
+        for (int i = 0; i < N_POINTS; i++) {
+            const uint32_t triangle = (uint32_t)((int64_t)i * mesh->n_triangles / N_POINTS);
+            static const float third[2] = { 1.f / 3, 1.f / 3 };
+            double at[3], p[3], to_eye[3], uv[2], normal[3] = { 0, 0, 0 };
+            float start[3], dir[3], channels[IMAGE_MAX_CHANNELS];
+            value[trial][i][k] = NAN;
+            rays_start(rays, triangle, third, start);
+            for (int c = 0; c < 3; c++) {
+                at[c] = start[c];
+                for (int j = 0; j < 3; j++)
+                    normal[c] += mesh->normal[mesh->triangle[triangle][j]][c];
+                to_eye[c] = eye[c] - at[c];
+                dir[c] = (float)to_eye[c];
+            }
+            mat3_mul_vec(p, turn, at);
+            if (!camera_project(camera, p, uv, NULL) || !(uv[0] >= 0 && uv[0] <= camera->width_px) ||
+                !(uv[1] >= 0 && uv[1] <= camera->height_px) || rgb[0] < 0 || rgb[1] < 0 || rgb[2] < 0)
+                continue;
+            vec3_normalise(normal);
+            if (vec3_dot(normal, to_eye) < .4 * vec3_norm(to_eye) || rays_blocked(rays, start, dir, 0, 1))
+                continue;
+            image_bilinear(image, uv[0], uv[1], channels);
+            const float y = .2126f * channels[rgb[0]] + .7152f * channels[rgb[1]] + .0722f * channels[rgb[2]];
+            value[trial][i][k] = isfinite(y) ? logf(fmaxf(y, 1e-6f)) : NAN;
+        }
+    }
+}
+
+static double agreement_of(float value[N_POINTS][MAX_PICTURES])
+{
+    double within = 0, sum = 0, square = 0;
+    int n_within = 0, n = 0, n_points = 0;
+    for (int i = 0; i < N_POINTS; i++) {
+        double mean = 0, deviation = 0;
+        int n_seen = 0;
+        for (int k = 0; k < MAX_PICTURES; k++)
+            if (!isnan(value[i][k]))
+                mean += value[i][k], n_seen++;
+        if (n_seen < 2)
+            continue;
+        mean /= n_seen;
+        for (int k = 0; k < MAX_PICTURES; k++)
+            if (!isnan(value[i][k])) {
+                deviation += (value[i][k] - mean) * (value[i][k] - mean);
+                sum += value[i][k], square += (double)value[i][k] * value[i][k], n++;
+            }
+        within += deviation, n_within += n_seen - 1, n_points++;
+    }
+    const double total = n ? square / n - sum / n * (sum / n) : 0;
+    return n_points >= N_POINTS / 5 && total > 1e-4 ? 1 - within / n_within / total : NAN;
+}
+
+int cameras_measure_agreement(double agreement[CAMERAS_N_AGREEMENTS], const struct cameras *c, const struct mesh *mesh,
+                              const struct rays *rays, char *const *picture)
+{
+    int n_pictures = 0, n_met = 0, n_looked = 0, err = 0;
+    float (*value)[N_POINTS][MAX_PICTURES] = malloc(sizeof(brightness));
+    if (!value)
+        return -ENOMEM;
+    for (int t = 0; t < CAMERAS_N_AGREEMENTS; t++)
+        for (int i = 0; i < N_POINTS; i++)
+            for (int k = 0; k < MAX_PICTURES; k++)
+                value[t][i][k] = NAN;
+    for (int v = 0; v < c->n; v++)
+        n_pictures += picture[v] != NULL;
+    const int n_wanted = n_pictures < MAX_PICTURES ? n_pictures : MAX_PICTURES;
+    for (int v = 0; v < c->n && !err; v++) { // evenly spread over those that have one
+        if (!picture[v] || (int64_t)n_looked * n_pictures > (int64_t)n_met++ * n_wanted || n_looked == n_wanted)
+            continue;
+        struct image image;
+        struct camera camera = c->view[v];
+        err = image_read(&image, picture[v]);
+        if (err)
+            break;
+        camera_resize(&camera, image.width, image.height);
+        look(value, n_looked++, &camera, &image, mesh, rays);
+        image_free(&image);
+    }
+    for (int t = 0; t < CAMERAS_N_AGREEMENTS && !err; t++)
+        agreement[t] = agreement_of(value[t]);
+    free(value);
+    return err;
+}
+
+int cameras_check_pictures(const struct cameras *c, const struct mesh *mesh, const struct rays *rays, char *const *picture,
+                           const char *path, const char *mesh_path)
+{
+    double agreement[CAMERAS_N_AGREEMENTS];
+    const int err = cameras_measure_agreement(agreement, c, mesh, rays, picture);
+    if (err)
+        return err;
+    int best = 0, n = 0;
+    char all[CAMERAS_N_AGREEMENTS * 64];
+    for (int i = 0; i < CAMERAS_N_AGREEMENTS; i++) {
+        if (agreement[i] > agreement[best])
+            best = i;
+        n += snprintf(all + n, sizeof(all) - (size_t)n, "%s%s %.2f", i ? ", " : "", all_trials[i].name, agreement[i]);
+    }
+    log_debug("cameras: agreement of the pictures on %s: %s", mesh_path, all);
+    if (agreement[best] > .5 && agreement[best] > agreement[0] + .3)
+        log_warning("cameras: the pictures of %s agree about the surface of %s better if it is %s%s: it was %s on export; agreement "
+                    "(1: all of them see the same) by what is done to the mesh: %s", path, mesh_path, best > N_TURNS ? "" : "turned to ",
+                    all_trials[best].name, best > N_TURNS ? "mirrored" : "turned", all);
     return 0;
 }

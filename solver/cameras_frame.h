@@ -3,10 +3,11 @@
 //
 // A trial turns, mirrors or scales the mesh and counts how many of its vertices (up to 1,000, of up to 100 views) then lie in the
 // pictures, and how much of a picture they span. Cameras that look at a mesh from all around hit it mirrored or turned as well:
-// these trials find frames that differ in where things are, not ones that agree in all but the surface's detail.
+// these trials find frames that differ in where things are. cameras_check_pictures() finds the others.
 #pragma once
 #include "solver/cameras.h"
 #include "solver/mesh.h"
+#include "solver/rays.h"
 
 enum { CAMERAS_N_TRIALS = 14 }; // [0] is the mesh as it is
 struct cameras_trial {
@@ -23,3 +24,15 @@ void cameras_try_frames(struct cameras_trial trials[CAMERAS_N_TRIALS], const str
 // rate of every trial. As cameras_read_with(); -EDOM (logged): they do not belong together.
 int cameras_read_for_mesh(struct cameras *out, const char *path, const struct cameras_options *options,
                           const struct mesh *mesh, const char *mesh_path);
+
+// What counting hits cannot tell: a mesh that is mirrored or turned within the same place. Looks at the same 500 points of the
+// surface in up to 8 of the pictures: where cameras and mesh belong together, the pictures agree about the points' brightness.
+// agreement[i] of trial i (as it is, turns, mirrors: the first 7): the share of the variance of log brightness that lies between
+// points, not between the views of one; NAN where too little is seen to say. picture: path of each view's, or NULL.
+// 0, or an error of image_read().
+enum { CAMERAS_N_AGREEMENTS = 7 };
+int cameras_measure_agreement(double agreement[CAMERAS_N_AGREEMENTS], const struct cameras *c, const struct mesh *mesh,
+                              const struct rays *rays, char *const *picture);
+// Measures it, and warns (with every figure) if another trial than the mesh as it is agrees clearly better. 0, or as above.
+int cameras_check_pictures(const struct cameras *c, const struct mesh *mesh, const struct rays *rays, char *const *picture,
+                           const char *path, const char *mesh_path);

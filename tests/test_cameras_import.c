@@ -803,6 +803,79 @@ static void close_ups_are_no_mismatch(void **state)
     scratch_empty();
 }
 
+// Pictures of a painted knot around the origin: mirrored, it is hit just as well, but is another knot.
+static void a_mirrored_mesh_in_the_same_place_is_found_by_its_pictures(void **state)
+{
+    (void)state;
+    enum { N = 10 };
+    const double middle[3] = { 0, 0, 0 }, up[3] = { 0, 0, 1 };
+    struct camera views[N];
+    const struct cameras c = { N, views };
+    char *pictures[N];
+    struct mesh mesh;
+    struct rays *rays;
+    assert_int_equal(shape_make(&mesh, SHAPE_KNOT, middle, .4, 6000), 0);
+    assert_int_equal(rays_new(&rays, &mesh), 0);
+    for (int i = 0; i < N; i++) {
+        const double a = 2 * M_PI * i / N, centre[3] = { 1.5 * cos(a), 1.5 * sin(a), .9 * (i % 3 - 1) };
+        struct image image;
+        char name[32];
+        views[i] = (struct camera){ .width_px = 120, .height_px = 90, .fx = 160, .fy = 160, .cx = 60, .cy = 45 };
+        camera_look_at(&views[i], centre, middle, up);
+        assert_int_equal(image_new(&image, 120, 90, 3, NULL), 0);
+        for (int k = 0; k < 120 * 90; k++) {
+            const double uv[2] = { k % 120 + .5, k / 120 + .5 };
+            const float from[3] = { (float)centre[0], (float)centre[1], (float)centre[2] };
+            double d[3];
+            struct ray_hit hit;
+            float value = .01f;
+            assert_true(camera_ray(&views[i], uv, d));
+            const float dir[3] = { (float)d[0], (float)d[1], (float)d[2] };
+            if (rays_hit(rays, from, dir, 0, 10, &hit)) {
+                double p[3];
+                vec3_add_scaled(p, centre, hit.t, d);
+                value = (float)(.5 + .4 * sin(9 * p[0] + 1) * sin(11 * p[1] + 2) * cos(7 * p[2] - 1));
+            }
+            for (int ch = 0; ch < 3; ch++)
+                image.data[3 * k + ch] = value;
+        }
+        snprintf(name, sizeof(name), "p%d.exr", i);
+        pictures[i] = strdup(scratch_path(name));
+        assert_int_equal(image_write_exr(&image, pictures[i], IMAGE_FLOAT, IMAGE_ZIP), 0);
+        image_free(&image);
+    }
+    for (int mirrored = 0; mirrored < 2; mirrored++) {
+        double agreement[CAMERAS_N_AGREEMENTS];
+        if (mirrored) {
+            static const double flip[9] = { 1, 0, 0, 0, -1, 0, 0, 0, 1 };
+            change_mesh(&mesh, flip);
+            for (int i = 0; i < mesh.n_vertices; i++)
+                mesh.normal[i][1] = -mesh.normal[i][1];
+            for (int i = 0; i < mesh.n_triangles; i++) { // the outside stays outside
+                const uint32_t swap = mesh.triangle[i][0];
+                mesh.triangle[i][0] = mesh.triangle[i][1], mesh.triangle[i][1] = swap;
+            }
+            rays_free(rays);
+            assert_int_equal(rays_new(&rays, &mesh), 0);
+            struct cameras_trial trials[CAMERAS_N_TRIALS]; // hits alone do not tell
+            cameras_try_frames(trials, &c, &mesh);
+            assert_true(trials[0].hit_rate == 1 && trials[5].hit_rate == 1);
+        }
+        warned[0] = 0;
+        assert_int_equal(cameras_check_pictures(&c, &mesh, rays, pictures, "cameras", "mesh.obj"), 0);
+        assert_int_equal(!!strstr(warned, "if it is mirrored (x, -y, z): it was mirrored on export"), mirrored);
+        assert_int_equal(!!warned[0], mirrored);
+        assert_int_equal(cameras_measure_agreement(agreement, &c, &mesh, rays, pictures), 0);
+        if (!(agreement[5 * mirrored] > .8) || (mirrored && !(agreement[0] < .5)))
+            fail_msg("mirrored %d: %g as it is, %g mirrored", mirrored, agreement[0], agreement[5]);
+    }
+    for (int i = 0; i < N; i++)
+        free(pictures[i]);
+    rays_free(rays);
+    mesh_free(&mesh);
+    scratch_empty();
+}
+
 // Metashape exports the mesh in the world, or in the chunk's own frame: the cameras follow.
 static void metashapes_transform_is_taken_or_left_by_test(void **state)
 {
@@ -974,6 +1047,7 @@ int main(void)
         cmocka_unit_test(headers_of_pictures_tell_their_size),
         cmocka_unit_test(frames_that_differ_are_found_out_and_named),
         cmocka_unit_test(close_ups_are_no_mismatch),
+        cmocka_unit_test(a_mirrored_mesh_in_the_same_place_is_found_by_its_pictures),
         cmocka_unit_test(metashapes_transform_is_taken_or_left_by_test),
         cmocka_unit_test(files_of_real_tools_are_read),
     };

@@ -180,7 +180,12 @@ int inputs_load(struct inputs *in)
     if (!err)
         err = cameras_read_for_mesh(&in->cameras, in->cameras_path, &sizes, &in->mesh,
                                     in->mesh_path);
-    return err ? err : find_pictures(in);
+    if (!err)
+        err = find_pictures(in);
+    if (!err && in->picture)
+        err = cameras_check_pictures(&in->cameras, &in->mesh, in->rays, in->picture,
+                                     in->cameras_path, in->mesh_path);
+    return err;
 }
 
 void inputs_free(struct inputs *in)
