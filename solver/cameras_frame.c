@@ -302,7 +302,9 @@ int cameras_check_pictures(const struct cameras *c, const struct mesh *mesh, con
     for (int i = 0; i < CAMERAS_N_AGREEMENTS; i++) {
         if (agreement[i] > agreement[best])
             best = i;
-        n += snprintf(all + n, sizeof(all) - (size_t)n, "%s%s %.2f", i ? ", " : "", all_trials[i].name, agreement[i]);
+        n += isnan(agreement[i])
+                 ? snprintf(all + n, sizeof(all) - (size_t)n, "%s%s unseen", i ? ", " : "", all_trials[i].name)
+                 : snprintf(all + n, sizeof(all) - (size_t)n, "%s%s %.2f", i ? ", " : "", all_trials[i].name, agreement[i]);
     }
     log_debug("cameras: agreement of the pictures on %s: %s", mesh_path, all);
     if (agreement[best] > .5 && agreement[best] > agreement[0] + .3)

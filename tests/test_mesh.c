@@ -226,6 +226,68 @@ static void every_format_gives_the_same_uvs(void **state)
     setlocale(LC_ALL, no_locale);
 }
 
+// A square of two triangles that share two corners in space but not in the atlas, as Metashape and MeshLab write them. The second
+// face names its corners after its UVs; a property of another kind lies between.
+static void ply_with_uvs_per_corner_keeps_its_seams(void **state)
+{
+    (void)state;
+    static const float position[4][3] = { { 0, 0, 0 }, { 1, 0, 0 }, { 1, 1, .25f }, { -1e-7f, 1, 0 } };
+    static const float uv[2][6] = { { .125f, 0, .25f, 0, .25f, .5f }, { .75f, .5f, 1, 1, .5f, 1 } };
+    static const int corner[2][3] = { { 0, 1, 2 }, { 0, 2, 3 } };
+    static const char *const encodings[3] = { "ascii", "binary_little_endian", "binary_big_endian" };
+    if (!setlocale(LC_ALL, "de_DE.UTF-8")) // decimal commas, where the machine has them
+        setlocale(LC_ALL, "C");
+    for (int encoding = 0; encoding < 3; encoding++) {
+        unsigned char bytes[2048];
+        int n = sprintf((char *)bytes, "ply\r\nformat %s 1.0\r\ncomment TextureFile a.png\nelement vertex 4\nproperty float x\n"
+                                       "property float y\nproperty float z\nproperty uchar red\nelement face 2\nproperty uchar flags\n"
+                                       "property list uchar float texcoord\nproperty list uchar int vertex_indices\n"
+                                       "property int texnumber\nend_header\n", encodings[encoding]);
+        for (int i = 0; i < 4 && encoding == 0; i++)
+            n += sprintf((char *)bytes + n, "%d.%02de0 %d %d.%d 7\n", (int)position[i][0], 0, (int)position[i][1], 0, i == 2 ? 25 : 0);
+        for (int i = 0; i < 2 && encoding == 0; i++) {
+            n += sprintf((char *)bytes + n, "1 6");
+            for (int k = 0; k < 6; k++)
+                n += sprintf((char *)bytes + n, " %d.%03d", (int)uv[i][k], (int)(1000 * uv[i][k]) % 1000);
+            n += sprintf((char *)bytes + n, " 3 %d %d %d -1\n", corner[i][0], corner[i][1], corner[i][2]);
+        }
+        unsigned char *at = bytes + n;
+#define PUT(value) do { uint32_t w; memcpy(&w, &(value), 4); for (int b = 0; b < 4; b++) \
+        *at++ = (unsigned char)(w >> 8 * (encoding == 1 ? b : 3 - b)); } while (0)
+        for (int i = 0; i < 4 && encoding > 0; i++) {
+            for (int k = 0; k < 3; k++)
+                PUT(position[i][k]);
+            *at++ = 7;
+        }
+        for (int i = 0; i < 2 && encoding > 0; i++) {
+            *at++ = 1, *at++ = 6;
+            for (int k = 0; k < 6; k++)
+                PUT(uv[i][k]);
+            *at++ = 3;
+            for (int k = 0; k < 3; k++)
+                PUT(corner[i][k]);
+            PUT(corner[0][0]);
+        }
+#undef PUT
+        struct mesh m;
+        struct mesh_check check;
+        const int err = read_bytes(&m, &check, "corners.ply", bytes, (size_t)(at - bytes));
+        if (err)
+            fail_msg("%s: %d %s", encodings[encoding], err, errors);
+        assert_true(m.n_triangles == 2 && m.n_points == 4 && m.n_vertices == 6 && m.n_charts == 2);
+        for (int i = 0; i < 2; i++)
+            for (int k = 0; k < 3; k++) {
+                const uint32_t v = m.triangle[i][k];
+                for (int c = 0; c < 2; c++)
+                    assert_true(m.uv[v][c] == uv[i][2 * k + c]);
+                for (int c = 0; c < 3; c++)
+                    assert_true(fabsf(m.position_m[v][c] - position[corner[i][k]][c]) < 2e-7f);
+            }
+        mesh_free(&m);
+    }
+    setlocale(LC_ALL, "C");
+}
+
 static void node_transforms_are_applied_and_mirrors_keep_their_outside(void **state)
 {
     (void)state;
@@ -466,7 +528,15 @@ static void broken_files_are_refused_with_their_place(void **state)
         { "ply\nformat ascii 1.0\nelement vertex 1\nproperty float x\nend_header\n1\n", -EINVAL, "point cloud" },
         { "ply\nformat ascii 1.0\nelement face 1\nproperty list float int vertex_indices\nend_header\n", -EINVAL, "'float'" },
         { "ply\nformat ascii 1.0\nelement face 1\nproperty list uchar int vertex_indices\n"
-          "property list uchar float texcoord\nend_header\n", -ENOTSUP, "export the mesh as OBJ or GLB" },
+          "property list uchar int texcoord\nend_header\n", -EINVAL, "texcoord is of whole numbers" },
+        { "ply\nformat ascii 1.0\nelement vertex 3\nproperty float x\nproperty float y\nproperty float z\nelement face 1\nproperty list uchar "
+          "int vertex_indices\nproperty list uchar float texcoord\nend_header\n0 0 0\n1 0 0\n0 1 0\n3 0 1 2 4 0 0 1 0\n", -EINVAL,
+          "face 0 has 4 numbers in texcoord" },
+        { "ply\nformat ascii 1.0\nelement vertex 3\nproperty float x\nproperty float y\nproperty float z\nelement face 1\nproperty list uchar "
+          "int vertex_indices\nproperty list uchar float texcoord\nend_header\n0 0 0\n1 0 0\n0 1 0\n3 0 1 2 6 0 0 1 nan 0 1\n", -EINVAL,
+          "within face 1 of 1" },
+        { "ply\nformat ascii 1.0\nelement vertex 3\nproperty float x\nproperty float y\nproperty float z\nelement face 1\nproperty list uchar "
+          "int vertex_indices\nproperty list uchar float texcoord\nend_header\n0 0 0\n1 0 0\n0 1 0\n3 0 1 2 0\n", -EINVAL, "no UVs" },
         { "ply\nformat ternary 1.0\n", -EINVAL, "'ternary'" },
         { "ply\nproperty float x\n", -EINVAL, "before any element" },
         { "ply\nformat ascii 1.0\nelement vertex 3\n", -EINVAL, "before end_header" },
@@ -686,6 +756,7 @@ int main(void)
 {
     const struct CMUnitTest tests[] = {
         cmocka_unit_test(every_format_gives_the_same_uvs),
+        cmocka_unit_test(ply_with_uvs_per_corner_keeps_its_seams),
         cmocka_unit_test(node_transforms_are_applied_and_mirrors_keep_their_outside),
         cmocka_unit_test(seams_are_no_creases),
         cmocka_unit_test(charts_join_where_edges_meet_in_space_and_atlas),
