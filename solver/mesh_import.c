@@ -636,8 +636,8 @@ static int check_gltf_accessor(const struct mesh_file *f, const struct json *doc
     return 0;
 }
 
-// Positions, normals and UVs as 32-bit floats: assimp takes the bytes of other types for floats.
-static int check_gltf_attribute(const struct mesh_file *f, const struct json *doc, const char *primitive, const char *name,
+// Positions, normals and UVs: 32-bit floats, or (KHR_mesh_quantization) whole numbers of 8 or 16 bits.
+static int check_gltf_attribute(struct mesh_file *f, const struct json *doc, const char *primitive, const char *name,
                                 const char *type, bool needed)
 {
     char path[160];
@@ -651,9 +651,10 @@ static int check_gltf_attribute(const struct mesh_file *f, const struct json *do
     const int64_t component = gltf_int(doc, "accessors", accessor, "componentType", -1, 5126);
     snprintf(path, sizeof(path), "accessors.%" PRId64 ".type", accessor);
     (void)json_get_string(doc, path, &found);
-    if (component != 5126)
-        return refuse(f, -ENOTSUP, "%s: %s is quantised (component type %" PRId64 "); export it as 32-bit floats (5126)",
-                      primitive, name, component);
+    if (component > 5123 && component != 5126)
+        return refuse(f, -EINVAL, "%s: %s is of component type %" PRId64 "; expected 32-bit floats (5126), or 8 or 16 bits (5120 to "
+                      "5123)", primitive, name, component);
+    f->is_quantised = f->is_quantised || component != 5126;
     return strcmp(found, type) ? refuse(f, -EINVAL, "%s: %s is %s; expected %s", primitive, name, found, type) : 0;
 }
 
@@ -746,8 +747,7 @@ static void percent_decode(char *s)
     *out = 0;
 }
 
-// name in the folder of path, as it is or (where there is no such file) percent-decoded. NULL without memory.
-static char *path_beside(const char *path, const char *name)
+char *mesh_path_beside(const char *path, const char *name)
 {
     const char *slash = strrchr(path, '/');
     char *full;
@@ -774,7 +774,7 @@ static int check_gltf_buffer(const struct mesh_file *f, const struct json *doc, 
     }
     if (!strncmp(uri, "data:", 5))
         return 0;
-    char *full = path_beside(f->path, uri);
+    char *full = mesh_path_beside(f->path, uri);
     int err = full ? 0 : -ENOMEM;
     if (full && stat(full, &st))
         err = refuse(f, -EINVAL, "buffer %" PRId64 " is the file '%s': %s", i, full, strerror(errno));
@@ -1001,7 +1001,7 @@ struct importing {
 
 static int read_beside(struct opened *o, const char *path, const char *name)
 {
-    char *full = path_beside(path, name);
+    char *full = mesh_path_beside(path, name);
     const int err = full ? file_read(&o->owned, &o->n_bytes, full, max_file_bytes) : -ENOMEM;
     if (err)
         log_error("mesh: %s: its buffer %s is needed: export the mesh again, or as one GLB", path, name);
@@ -1210,7 +1210,12 @@ static int import(struct soup *s, const struct mesh_file *f, int format)
     struct totals totals = { 0, 0 };
     struct adding adding = { s, f };
     char *rewritten = NULL;
-    if (formats[format].rewrite) {
+    if (f->is_quantised) {
+        err = mesh_gltf_floats(&rewritten, &shown.n_bytes, f);
+        if (err)
+            return err;
+        shown.bytes = rewritten;
+    } else if (formats[format].rewrite) {
         rewritten = formats[format].rewrite(f, &shown.n_bytes);
         if (!rewritten)
             return -ENOMEM;
