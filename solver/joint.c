@@ -153,10 +153,6 @@ static int continuation(struct stage1 *s, const uint8_t *aside)
     for (double w = first_w_sim; !err && n < MAX_STEPS; w = w > 1e-13 ? w / 10 : 0) {
         struct photometric_error e;
         s->w_sim = weight[n] = w > last ? w : last;
-        if (s->set->planes && w <= first_plane_w_sim)
-            err = find_planes(s, plane_tolerance, plane_share * s->w_sim);
-        if (err)
-            break;
         s->p.texel_step = stage1_step_for(s, COARSE_SAMPLES);
         err = stage1_trace_visibility(s);
         if (!err)
@@ -187,8 +183,19 @@ static int continuation(struct stage1 *s, const uint8_t *aside)
         photometric_state_copy(&s->p, &s->base, &at[chosen]);
         s->w_sim = weight[chosen];
         log_debug("joint: w_sim %.0e it is", s->w_sim);
-        if (s->set->planes)
+        for (int k = 0; !err && s->set->planes && k < 2; k++) {
+            struct photometric_error e;
             err = find_planes(s, plane_tolerance, plane_share * s->w_sim);
+            s->p.texel_step = stage1_step_for(s, COARSE_SAMPLES);
+            if (!err)
+                err = stage1_minimise(s, 8, 2e-3, NULL);
+            s->p.texel_step = stage1_step_for(s, FINE_SAMPLES);
+            if (!err)
+                err = photometric_evaluate(&s->p, &s->base, s->p.albedo == ALBEDO_FREE, &e);
+            if (!err)
+                err = stage1_measure(s, &s->base, aside, &e);
+            log_debug("joint: w_sim %.0e: views set aside %.4f %%", s->w_sim, photometric_rmse_percent(&e));
+        }
     }
     progress_end();
     for (int i = 0; i < MAX_STEPS; i++)

@@ -62,6 +62,8 @@ static int find_pairs(struct stage1 *s, const struct lights *l)
     return err;
 }
 
+static double similarity_on_planes = .1;
+
 // u(x): log(1/r), or r itself in paper mode; and du/dx.
 static double similarity_of(const struct stage1 *s, double x, double *slope)
 {
@@ -80,10 +82,10 @@ static double add_similarity(const struct stage1 *s, const double *x, double *A,
     double cost = 0;
     for (int k = 0; s->w_sim > 0 && k < s->n_pairs; k++) {
         const int i = first + s->pairs[k].i, j = first + s->pairs[k].j;
-        if (s->emitters.n && s->emitters.of[i - first] >= 0 && s->emitters.of[j - first] >= 0)
-            continue; // their planes say more
         double si, sj;
-        const double w = s->w_sim * s->pairs[k].weight;
+        // Of lights on planes, these say more; but a plane that the pictures hardly see must not drift off either.
+        const bool on_planes = s->emitters.n && s->emitters.of[i - first] >= 0 && s->emitters.of[j - first] >= 0;
+        const double w = (on_planes ? similarity_on_planes : 1) * s->w_sim * s->pairs[k].weight;
         const double e = similarity_of(s, x[i], &si) - similarity_of(s, x[j], &sj);
         cost += .5 * w * e * e;
         if (!A)
@@ -320,6 +322,12 @@ void stage1_set_distances(struct stage1 *s, double distance_m)
 }
 
 // ---- a stage's life --------------------------------------------------------------------------------------------------------
+
+__attribute__((constructor)) static void tmp_env(void)
+{
+    if (getenv("SOP"))
+        similarity_on_planes = atof(getenv("SOP"));
+}
 
 int stage1_new(struct stage1 *s, const struct photometric *p, const struct lights *lights, const struct rays *rays,
                       const struct joint_settings *set)
