@@ -61,22 +61,34 @@ static int split_by_luminosity(const struct stage1 *s, float *low, float *high)
     return err;
 }
 
+// Where the search for the distances begins: 1/r of each light.
+static void first_distances(const struct stage1 *s, double *inverse_distance)
+{
+    const double common_m = s->set->start_distance_m > 0 ? s->set->start_distance_m : 2;
+    for (int i = 0; i < s->base.lights.n; i++) {
+        const double own = s->base.lights.inverse_distance[i];
+        inverse_distance[i] = s->set->start_distance_m > 0 || own <= 0 ? 1 / common_m : own;
+    }
+}
+
 int stage1_alternate(struct stage1 *s, const uint8_t *fit)
 {
-    const size_t n = (size_t)s->p.samples->n;
+    const size_t n = (size_t)s->p.samples->n, n_lights = (size_t)s->base.lights.n;
     float *low = malloc((n + 1) * sizeof(float)), *high = malloc((n + 1) * sizeof(float));
+    double *first = malloc(n_lights * sizeof(double));
     struct photometric_error e;
-    int err = low && high ? 0 : -ENOMEM;
+    int err = low && high && first ? 0 : -ENOMEM;
+    if (err)
+        goto end;
+    first_distances(s, first);
     s->p.use_view = fit;
     s->p.texel_step = 1;
-    const double start_m = s->set->start_distance_m > 0 ? s->set->start_distance_m : 2;
-    stage1_set_distances(s, start_m);
+    s->w_sim = s->set->w_sim;
     s->stop = "cost";
-    if (!err && s->p.model == REFLECT_LAMBERT) { // data sets 1 and 2: the albedo is known or shared, so there is nothing to alternate
-        err = photometric_evaluate(&s->p, &s->base, false, &e);
-        s->w_sim = s->set->w_sim / fmax(3 * (double)e.n, 1);
-        if (!err)
-            err = stage1_minimise(s, 60, 1e-6, NULL);
+    if (s->p.model == REFLECT_LAMBERT) { // data sets 1 and 2: the albedo is known or shared, so there is nothing to alternate
+        memcpy(s->base.lights.inverse_distance, first, n_lights * sizeof(double));
+        err = stage1_minimise(s, 60, 1e-6, NULL);
+        s->w_sim_sum = s->w_sim * s->n_residuals;
         goto end;
     }
     progress_begin("alternating", 30);
@@ -89,10 +101,10 @@ int stage1_alternate(struct stage1 *s, const uint8_t *fit)
             err = photometric_evaluate(&dark, &s->base, true, &e);
         if (!err)
             err = split_by_luminosity(s, low, high); // with the new albedo
-        if (round == 0)
-            stage1_set_distances(s, start_m);
         if (err)
             break;
+        if (round == 0)
+            memcpy(s->base.lights.inverse_distance, first, n_lights * sizeof(double));
         s->p.weight = high, s->p.albedo = ALBEDO_GIVEN;
         err = photometric_evaluate(&s->p, &s->base, false, &e);
         if (err)
@@ -101,9 +113,9 @@ int stage1_alternate(struct stage1 *s, const uint8_t *fit)
             s->stop = "no bright samples";
             break;
         }
-        s->w_sim = s->set->w_sim / (3 * (double)e.n);
         const double before = e.cost;
         err = stage1_minimise(s, 20, 1e-6, NULL);
+        s->w_sim_sum = s->w_sim * s->n_residuals;
         if (!err)
             err = photometric_evaluate(&s->p, &s->base, false, &e);
         progress_add(1);
@@ -117,6 +129,6 @@ end:
     s->p.weight = NULL;
     free(low);
     free(high);
+    free(first);
     return err;
 }
-
