@@ -71,6 +71,23 @@ static void first_distances(const struct stage1 *s, double *inverse_distance)
     }
 }
 
+// No light is inside the object: there, where what it lights ends, the search sticks.
+static void keep_lights_off(struct stage1 *s)
+{
+    const struct texels *t = s->p.texels;
+    double radius_m = 0;
+    for (int i = 0; i < t->n; i++) {
+        double off[3];
+        for (int c = 0; c < 3; c++)
+            off[c] = t->position_m[i][c] - s->first_centre_m[c];
+        radius_m = fmax(radius_m, vec3_norm(off));
+    }
+    for (int g = 0; g < s->p.n_groups; g++) {
+        double *lower = &s->lower[s->layout.inverse_distance + g];
+        *lower = fmin(fmax(*lower, 1.5 * radius_m), s->upper[s->layout.inverse_distance + g]);
+    }
+}
+
 int stage1_alternate(struct stage1 *s, const uint8_t *fit)
 {
     const size_t n = (size_t)s->p.samples->n, n_lights = (size_t)s->base.lights.n;
@@ -81,6 +98,7 @@ int stage1_alternate(struct stage1 *s, const uint8_t *fit)
     if (err)
         goto end;
     first_distances(s, first);
+    keep_lights_off(s);
     s->p.use_view = fit;
     s->p.texel_step = 1;
     s->w_sim = s->set->w_sim;
