@@ -94,6 +94,7 @@ int stage1_alternate(struct stage1 *s, const uint8_t *fit)
     float *low = malloc((n + 1) * sizeof(float)), *high = malloc((n + 1) * sizeof(float));
     double *first = malloc(n_lights * sizeof(double));
     struct photometric_error e;
+    double cost = INFINITY; // of a bright sample
     int err = low && high && first ? 0 : -ENOMEM;
     if (err)
         goto end;
@@ -102,7 +103,6 @@ int stage1_alternate(struct stage1 *s, const uint8_t *fit)
     s->p.use_view = fit;
     s->p.texel_step = 1;
     s->w_sim = s->set->w_sim;
-    s->stop = "cost";
     if (s->p.model == REFLECT_LAMBERT) { // data sets 1 and 2: the albedo is known or shared, so there is nothing to alternate
         memcpy(s->base.lights.inverse_distance, first, n_lights * sizeof(double));
         err = stage1_minimise(s, 60, 1e-6, NULL);
@@ -131,16 +131,19 @@ int stage1_alternate(struct stage1 *s, const uint8_t *fit)
             s->stop = "no bright samples";
             break;
         }
-        const double before = e.cost;
         err = stage1_minimise(s, 20, 1e-6, NULL);
         s->w_sim_sum = s->w_sim * s->n_residuals;
         if (!err)
             err = photometric_evaluate(&s->p, &s->base, false, &e);
         progress_add(1);
-        if (!err && round > 0 && fabs(before - e.cost) < 1e-4 * before)
+        // The two halves do not fall along one function, so from some round on they may well rise together.
+        const double before = cost;
+        cost = e.cost / (double)e.n;
+        s->stop = "max_iterations";
+        if (!err && cost > (1 - 1e-4) * before) {
+            s->stop = "cost";
             break;
-        if (round == 29)
-            s->stop = "max_iterations";
+        }
     }
     progress_end();
 end:

@@ -14,7 +14,7 @@ const char *const method_names[3] = { "joint", "alternating", "directional" };
 
 struct joint_settings joint_defaults(enum method method)
 {
-    return (struct joint_settings){ .method = method, .w_sim = method == METHOD_ALTERNATING ? 3e-7 : -1,
+    return (struct joint_settings){ .method = method, .w_sim = method == METHOD_ALTERNATING ? 3e-9 : -1,
                                     .start_distance_m = method == METHOD_ALTERNATING ? 2 : 0, .visibility = method == METHOD_JOINT,
                                     .robust = false };
 }
