@@ -14,7 +14,7 @@ const char *const method_names[3] = { "joint", "alternating", "directional" };
 
 struct joint_settings joint_defaults(enum method method)
 {
-    return (struct joint_settings){ .method = method, .w_sim = method == METHOD_ALTERNATING ? 1e-3 : -1,
+    return (struct joint_settings){ .method = method, .w_sim = method == METHOD_ALTERNATING ? 3e-9 : -1,
                                     .start_distance_m = method == METHOD_ALTERNATING ? 2 : 0, .visibility = method == METHOD_JOINT,
                                     .planes = method == METHOD_JOINT, .robust = false };
 }
@@ -435,8 +435,7 @@ int joint_solve(struct joint_result *out, const struct texels *texels, const str
         out->n_jacobians = s.n_jacobians;
         out->n_evaluations = s.n_evaluations;
         out->w_sim = s.w_sim;
-        // the paper's is of the bright samples
-        out->w_sim_sum = set->method == METHOD_ALTERNATING ? set->w_sim : s.w_sim * s.n_residuals;
+        out->w_sim_sum = set->method == METHOD_ALTERNATING ? s.w_sim_sum : s.w_sim * s.n_residuals;
         out->stop_reason = s.stop ? s.stop : "";
         out->state = s.base;
         memset(&s.base, 0, sizeof(s.base));

@@ -18,9 +18,9 @@ struct joint_settings {
     enum disney_variant variant;
     enum albedo_mode albedo;
     double given_albedo[3];  // ALBEDO_GIVEN
-    double start_distance_m; // of every light; 0: swept over .7 .. 4 m (joint)
-    double w_sim;            // alternating: weight of Eq. 11 beside the *sum* of squared residuals (paper). joint: the last weight of the
-                             // continuation, beside the *mean*; negative: stopped by the views set aside (default)
+    double start_distance_m; // of every light; 0: swept over .7 .. 4 m (joint); each light's own, 2 m where it has none (alternating)
+    double w_sim;            // weight of Eq. 11 beside the *mean* of squared residuals. alternating: 3e-9 (default), held. joint: the last
+                             // weight of the continuation; negative: stopped by the views set aside (default)
     bool visibility;         // trace shadows, and again when lights have moved
     bool planes;             // joint: lights that lie on one plane, if the views set aside accept it, stay on it
     bool robust;             // down-weight outliers in the last stage
@@ -43,7 +43,7 @@ struct joint_result {
     double rmse_fit_percent, rmse_held_out_percent; // samples; -1: no view held out
     int64_t n_fit, n_held_out;
     int n_jacobians, n_evaluations;
-    double w_sim;                    // the last one, our normalisation (mean); w_sim_sum: the paper's (sum)
+    double w_sim;                    // the last one, our normalisation (mean); w_sim_sum: beside the sum
     double w_sim_sum;
     const char *stop_reason;
     // Standard deviations from the final normal equations; infinite where nothing depends on an unknown. They know of

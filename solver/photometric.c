@@ -154,6 +154,7 @@ struct job {
     int n_workers;
     bool fit;
     int n_free, *column;          // the compact place of each unknown, -1: not free
+    bool one_row;                 // diffuse, with neither gains nor albedos to find: a texel's views differ in a row's length only
     int *group_first;             // [n_groups + 1] where the lights of each group begin, when they are ascending and all groups are free; else NULL
     bool tinted;                  // the tint matters: solve the albedo twice
     float (*residual)[3];         // [samples n] for the scale and the robust weights, or NULL
@@ -194,6 +195,9 @@ static int job_new(struct job *j, const struct photometric *p, struct photometri
         j->column[i] = is_free[i] ? j->n_free++ : -1;
     if (!j->column)
         goto fail;
+    j->one_row = p->model == REFLECT_LAMBERT && p->albedo != ALBEDO_FREE;
+    for (int v = 0; is_free && v < j->layout.n_views; v++)
+        j->one_row &= !is_free[j->layout.gain + v];
     bool ascending = is_free;
     for (int i = 0; ascending && i < s->lights.n; i++)
         ascending = (i == 0 || p->group_of_light[i] >= p->group_of_light[i - 1]);
@@ -475,6 +479,32 @@ VECTOR_CLONES static void project_rows(float *rows, size_t stride, int n, const 
     }
 }
 
+// One row for all views of a diffuse texel: as long as theirs together, with what their residuals have along it.
+static void add_diffuse(const struct job *j, struct worker *w, int n_seen, const float albedo[3], const struct shade_jacobian *d,
+                        const struct shade_setup *setup)
+{
+    for (int c = 0; c < 3; c++) {
+        double length2 = 0, along = 0;
+        for (int k = 0; k < n_seen; k++) {
+            struct observation *o = &w->seen[k];
+            const double gain = (double)o->gain, weighted = (double)o->weight * gain;
+            o->constant[c] = 0, o->own[c] = o->gain * d->own[c];
+            const float r = residual_of(o, c, albedo[c]);
+            if (o->clipped && r == 0)
+                continue;
+            length2 += weighted * gain;
+            along += weighted * (double)r;
+        }
+        if (!(length2 > 0))
+            continue;
+        const float length = (float)sqrt(length2);
+        float *row = normal_rows_next(&w->rows, (float)(along / (double)length));
+        fill_row(j, row, c, 0, 1, d, setup); // scaled afterwards, so as to round alike whichever loop sums a group's lights
+        for (int i = 0; i < j->n_free; i++)
+            row[i] *= length;
+    }
+}
+
 static void add_texels(void *arg, int64_t begin, int64_t end, int worker, double *partial)
 {
     struct job *j = arg;
@@ -508,6 +538,10 @@ static void add_texels(void *arg, int64_t begin, int64_t end, int worker, double
                     setup.centre[c][i] *= k, setup.rotation[c][i] *= k;
                 for (int i = 0; i < j->lights.n; i++)
                     setup.inverse_distance[c][i] *= k;
+            }
+            if (j->one_row) {
+                add_diffuse(j, w, n_seen, m.albedo, &d, &setup);
+                continue;
             }
         } else {
             j->kernels->gather(&w->lit, &j->lights, &point, visible_of(j->p, texel), NULL);

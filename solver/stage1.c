@@ -297,6 +297,8 @@ int stage1_minimise(struct stage1 *s, int max_iterations, double relative_cost, 
     double scratch[s->layout.n];
     settings.max_iterations = max_iterations;
     settings.relative_cost = relative_cost;
+    if (s->in_distance) // radiance is far from linear in r, and a light that comes near the object changes everything
+        settings.mu = 10, settings.fresh_scale = true;
     photometric_pack(&s->p, &s->base, s->x);
     for (int g = 0; s->in_distance && g < s->p.n_groups; g++)
         s->x[s->layout.inverse_distance + g] = 1 / s->x[s->layout.inverse_distance + g];

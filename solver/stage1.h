@@ -19,6 +19,7 @@ struct stage1 {
     float *ratio;                         // [lights] of p.ratio_of_light
     bool in_distance;         // the unknown is r, not 1/r, and E_sim is Eq. 11 to the letter (paper)
     double w_sim;             // beside the mean of squares
+    double w_sim_sum;         // alternating: the same beside the sum, of the samples that are fitted
     double first_centre_m[3]; // joint: the centre is held near its first guess with the same weight, which ends at (nearly) 0
     double n_residuals;       // samples x 3 in use
     unsigned char *is_free;   // [layout.n]
