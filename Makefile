@@ -32,7 +32,7 @@ endif
 
 # ---- what is built ------------------------------------------------------------------------------------------------------
 TAKE := $(addprefix solver/take/,atomic_file.c image.c image_exr.c image_hdr.c image_png.c image_tiff.c json.c log.c progress.c take.c)
-SOLVER := $(addprefix solver/,alternating.c cameras.c cameras_colmap.c compare.c csv.c disney.c joint.c lights.c lm.c mesh.c mesh_import.c \
+SOLVER := $(addprefix solver/,alternating.c cameras.c cameras_colmap.c compare.c csv.c disney.c joint.c lights.c lm.c mesh.c mesh_import.c misfit.c \
   normal_equations.c orientation.c panorama.c parallel.c pcg.c photometric.c rays.c render.c samples.c shapes.c stage1.c synth.c \
   texels.c visibility.c)
 KERNELS := $(addprefix solver/kernels/,kernels.c kernels_ref.c kernels_portable.c kernels_avx2.c kernels_avx512.c)
@@ -76,6 +76,7 @@ $(BUILD)/tests/%: $(BUILD)/obj/tests/%.o $(BUILD)/libstudiorig.a
 	@mkdir -p $(@D)
 	@$(if $(V),,echo '  LD $@')
 	$(Q)$(CC) $(CFLAGS_ALL) $^ -lcmocka $(LIBS) -o $@
+$(BUILD)/tests/bench/stability_joint: $(call object,solver/commands/arguments.c)
 $(BUILD)/tests/test_pcg: LIBS += $(if $(wildcard /usr/include/suitesparse/cholmod.h),-lcholmod)
 $(BUILD)/fuzz/obj/%.o: %.c Makefile | deps-fuzz
 	@mkdir -p $(@D)

@@ -1,0 +1,25 @@
+// solver/misfit.h - is what is left of the pictures noise, or something that the model lacks?
+//
+// Noise differs from texel to texel; what a model lacks - a light, a shadow, an object that moved - is
+// shared by neighbours. So residuals of one view are compared some texels apart (far enough that
+// the two read no common pixel): their covariance is the structure's mean square, and what is left of
+// the variance is noise. That needs no knowledge of the cameras' noise. Two more means of the
+// residuals say where to look: over equal directions to the mirrored viewer (a light that is not in
+// the panorama leaves a bright spot there), and over the surface normal.
+#pragma once
+#include "solver/photometric.h"
+
+struct misfit {
+    int64_t n_samples, n_pairs;
+    double level;          // RMS of the pictures (1: white) over the samples looked at, all channels
+    double residual;       // RMS of the residuals
+    double noise;          // that part of it which neighbours do not share
+    double structure;      // that which they do; 0 where they share nothing
+    double by_view;        // RMS of the views' means, noise taken off: exposures, a camera that moved
+    double by_normal;      // of the means over like normals: light of a broad lobe
+    double by_mirror;      // of the means over like mirrored view directions: highlights
+    double brighter[3];    // unit, world: from where the pictures have most light that the model has not (mirrored views)
+};
+
+// At the state with its albedo, over the views and texels in use and what did not clip. 0 or -ENOMEM. Pure: same in, same out.
+int misfit_measure(struct misfit *out, const struct photometric *p, const struct photometric_state *s);
