@@ -12,7 +12,8 @@
 #include <time.h>
 
 struct stability_size {
-    int n_views, texture, n_lights, n_sub; // n_lights groups of n_sub lights each
+    int n_views, n_lights, n_sub; // n_lights groups of n_sub lights each
+    int texture, thin;            // of thin x thin texels one is looked at: small texels, few samples
 };
 
 enum { NOTHING_MISSING = -1, STRONGEST_LIGHT_MISSING = 100 }; // else: the bright panel of that number
@@ -69,11 +70,19 @@ static inline void studio_close(struct studio *s)
     memset(s, 0, sizeof(*s));
 }
 
-static inline int stability_cut(struct lights *out, const struct studio *s, const struct panorama *p)
+// The paper's lights are not split, as in `rigsolve solve`.
+static inline int stability_n_sub(const struct studio *s, enum method method)
 {
-    const int err = lights_median_cut(out, p, s->size.n_lights * s->size.n_sub);
+    return method == METHOD_ALTERNATING ? 1 : s->size.n_sub;
+}
+
+static inline int stability_cut(struct lights *out, const struct studio *s, const struct panorama *p, int n_sub)
+{
+    const int err = lights_median_cut(out, p, s->size.n_lights * n_sub);
     if (err)
         return err;
+    for (int i = 0; i < out->n; i++) // aligned runs are the regions of the coarser cut
+        out->group[i] = i / n_sub;
     memcpy(out->centre_m, s->truth.centre_m, sizeof(out->centre_m));
     memcpy(out->world_from_probe, s->truth.world_from_probe, sizeof(out->world_from_probe));
     return 0;
@@ -93,6 +102,23 @@ static inline void stability_pick_views(const struct studio *s, int n, uint64_t 
         picture[v] = s->take->view_paths[v];
 }
 
+// Leaves texels without samples.
+static inline void stability_thin(struct samples *m, const struct texels *t, int thin)
+{
+    int64_t to = 0, begin = 0;
+    for (int texel = 0; texel < m->n_texels; texel++) {
+        const int64_t end = m->first[texel + 1];
+        const int x = (int)t->pixel[texel] % t->size, y = (int)t->pixel[texel] / t->size;
+        m->first[texel] = to;
+        for (int64_t i = begin; x % thin == 0 && y % thin == 0 && i < end; i++, to++) {
+            m->view[to] = m->view[i], m->gradient[to] = m->gradient[i], m->flags[to] = m->flags[i];
+            memmove(m->radiance[to], m->radiance[i], sizeof(m->radiance[to]));
+        }
+        begin = end;
+    }
+    m->first[m->n_texels] = m->n = to;
+}
+
 static inline int stability_gather(struct samples *out, const struct studio *s, const struct texels *texels,
                                    const struct rays *rays, const struct cameras *cameras, int n_views, uint64_t seed,
                                    int n_threads)
@@ -104,6 +130,8 @@ static inline int stability_gather(struct samples *out, const struct studio *s, 
         return -ENOMEM;
     stability_pick_views(s, n_views, seed, picture);
     const int err = samples_gather(out, texels, rays, cameras, picture, &settings);
+    if (!err)
+        stability_thin(out, texels, s->size.thin);
     free(picture);
     return err;
 }
@@ -390,7 +418,7 @@ static inline int input_make(struct input *in, const struct studio *s, const str
     if (!err && (panel || p->mirrored))
         err = stability_change_panorama(in, s, p);
     if (!err)
-        err = stability_cut(&in->lights, s, &in->panorama);
+        err = stability_cut(&in->lights, s, &in->panorama, stability_n_sub(s, p->method));
     in->held_out = calloc((size_t)s->cameras.n, 1);
     if (!err && !in->held_out)
         err = -ENOMEM;
@@ -399,7 +427,7 @@ static inline int input_make(struct input *in, const struct studio *s, const str
         return err;
     }
     if (p->missing == STRONGEST_LIGHT_MISSING)
-        stability_darken_strongest(&in->lights, s->size.n_sub);
+        stability_darken_strongest(&in->lights, stability_n_sub(s, p->method));
     if (p->gain > 0 || p->noise > 0 || p->clipped > 0)
         stability_expose(in, p);
     const char *picture[s->cameras.n];
@@ -447,7 +475,7 @@ static inline int stability_measure_misfit(struct misfit *out, const struct inpu
 }
 
 static inline int stability_judge(struct stability_result *out, const struct input *in, const struct studio *s,
-                                  const struct joint_result *r)
+                                  const struct joint_result *r, int n_sub)
 {
     struct judgement j;
     struct lights l = in->lights;
@@ -456,7 +484,7 @@ static inline int stability_judge(struct stability_result *out, const struct inp
     memcpy(l.world_from_probe, r->state.lights.world_from_probe, sizeof(l.world_from_probe));
     l.inverse_distance = r->state.lights.inverse_distance;
     judge_clear(&j);
-    const int err = judge_lights(&j, &s->truth, &in->panorama, &l, s->size.n_sub);
+    const int err = judge_lights(&j, &s->truth, &in->panorama, &l, n_sub);
     vec3_sub(off, l.centre_m, s->truth.centre_m);
     out->centre_cm = 100 * vec3_norm(off);
     out->rotation_deg = judge_angle_between(l.world_from_probe, s->truth.world_from_probe) * 180 / M_PI;
@@ -491,7 +519,7 @@ static inline void stability_run(struct stability_result *out, const struct stud
         out->n_jacobians = r.n_jacobians;
         snprintf(out->stop, sizeof(out->stop), "%s", r.stop_reason);
         out->must_doubt = p->mirrored || (p->missing >= 0 && p->missing < STRONGEST_LIGHT_MISSING);
-        out->err = stability_judge(out, &in, s, &r);
+        out->err = stability_judge(out, &in, s, &r, stability_n_sub(s, p->method));
         if (!out->err)
             out->err = stability_measure_misfit(&out->misfit, &in, s, &set, &r, n_threads);
         out->success = out->distance_percent < stability_success_percent;

@@ -65,8 +65,9 @@ static struct settings {
     int n_seeds, n_random, n_workers;
     struct stability_size size;
     struct synth_settings synth;
-} settings = {.sets = "D2,D3", .methods = "joint,alternating", .takes = "build/stability/takes", .n_seeds = 3, .n_random = 100,
-              .size = {.n_views = 40, .texture = 48, .n_lights = 128, .n_sub = 4}};
+} settings = {.sets = "D2,D3", .methods = "joint,alternating", .takes = "build/stability/takes", 
+              .n_seeds = 2, .n_random = 100,
+              .size = {.n_views = 40, .texture = 96, .thin = 3, .n_lights = 64, .n_sub = 16}};
 
 static bool listed(const char *list, const char *name)
 {
@@ -118,15 +119,17 @@ static struct perturbation perturbation_of(enum axis_id axis, double v, double v
 static int make_plan(struct plan *plan)
 {
     static const char *const sets[MAX_SETS] = {"D2", "D3"};
+    const bool both = !settings.take && listed(settings.sets, sets[0]) && listed(settings.sets, sets[1]);
+    const int n_random = both ? (settings.n_random + 1) / 2 : settings.n_random, n_map = (settings.n_seeds + 1) / 2;
     int n = 0;
-    for (int seed = 1; seed <= (settings.n_random > settings.n_seeds ? settings.n_random : settings.n_seeds); seed++)
+    for (int seed = 1; seed <= (n_random > settings.n_seeds ? n_random : settings.n_seeds); seed++)
         for (int set = 0; set < MAX_SETS; set++)
             for (int a = 0; a < N_AXES; a++)
                 for (int m = METHOD_JOINT; m <= METHOD_ALTERNATING; m++) {
                     const struct axis *axis = &axes[a];
                     if (!(settings.take ? set == 0 : listed(settings.sets, sets[set])) || !listed(settings.methods, method_names[m]) ||
                         (settings.only && !listed(settings.only, axis->name)) || (m == METHOD_ALTERNATING && !axis->too_alternating) ||
-                        seed > (a == AXIS_RANDOM ? settings.n_random : settings.n_seeds))
+                        seed > (a == AXIS_RANDOM ? n_random : a == AXIS_MAP ? n_map : settings.n_seeds))
                         continue;
                     for (int i = 0; i < axis->n; i++)
                         for (int k = 0; k < (a == AXIS_MAP ? 5 : 1); k++) {
@@ -264,7 +267,7 @@ static void summarise(const struct plan *plan, int n, const struct done *done)
     for (int set = 0; set < MAX_SETS; set++)
         for (int m = METHOD_JOINT; m <= METHOD_ALTERNATING; m++)
             for (int a = 0; a < N_AXES; a++) {
-                int count[4] = {0}, runs = 0, broken = 0;
+                int count[4] = {0}, runs = 0, broken = 0, near = 0;
                 for (int i = 0; i < n; i++) {
                     const struct stability_result *r = &done[i].r;
                     if (plan[i].set != set || (int)plan[i].p.method != m || (int)plan[i].axis != a || atomic_load(&done[i].state) != 2)
@@ -275,14 +278,15 @@ static void summarise(const struct plan *plan, int n, const struct done *done)
                     }
                     const bool good = r->success && !r->must_doubt;
                     count[2 * !good + !r->trusted]++;
+                    near += r->distance_median_percent < stability_success_percent;
                     error[runs++] = r->distance_percent;
                 }
                 if (!runs && !broken)
                     continue;
                 qsort(error, (size_t)runs, sizeof(double), by_value);
                 fprintf(stderr, "%s %-11s %-20s %3d runs: %3d success (%.0f %%), %d success but doubted, %d failed and doubted, %d FAILED AND TRUSTED; "
-                        "distance error, median of runs %.1f %%%s\n", set_name(set), method_names[m], axes[a].name, runs, count[0] + count[1],
-                        100. * (count[0] + count[1]) / (runs ? runs : 1), count[1], count[3], count[2], runs ? error[runs / 2] : NAN,
+                        "median light below 5 %%: %d; mean error, median of runs %.1f %%%s\n", set_name(set), method_names[m], axes[a].name, runs, count[0] + count[1],
+                        100. * (count[0] + count[1]) / (runs ? runs : 1), count[1], count[3], count[2], near, runs ? error[runs / 2] : NAN,
                         broken ? "; some ended in an error" : "");
             }
 }
@@ -293,14 +297,15 @@ static const struct argp_option options[] = {
     {"sets", 's', "LIST", 0, "of D2,D3 (both)", 0},
     {"only", 'o', "AXIS,...", 0, "of the axes as they are named in the CSV; also map, random (all)", 0},
     {"methods", 'm', "LIST", 0, "of joint,alternating (both, the latter where it is compared)", 0},
-    {"starts", 'n', "N", 0, "random starts (100)", 0},
-    {"seeds", 'k', "N", 0, "per point of the other axes (3)", 0},
+    {"starts", 'n', "N", 0, "random starts, shared by the sets (100)", 0},
+    {"seeds", 'k', "N", 0, "per point of the other axes (2; the map: half as many)", 0},
     {"views", 'v', "N", 0, "fitted and held out (40)", 0},
-    {"texture", 't', "N", 0, "texels a side (48)", 0},
-    {"lights", 'l', "N", 0, "a power of two (128)", 0},
-    {"sub-lights", 'u', "K", 0, "each light is K (4)", 0},
+    {"texture", 't', "N", 0, "texels a side (96)", 0},
+    {"thin", 'i', "K", 0, "of K x K texels one is looked at (3)", 0},
+    {"lights", 'l', "N", 0, "a power of two (64)", 0},
+    {"sub-lights", 'u', "K", 0, "each light is K for joint, 1 for alternating (16)", 0},
     {"true-lights", 'T', "N", 0, "of the synthetic studio (4096)", 0},
-    {"size", 'z', "WxH", 0, "of its pictures (180x120)", 0},
+    {"size", 'z', "WxH", 0, "of its pictures (240x160)", 0},
     {"seed", 'S', "N", 0, "of the synthetic studio (1)", 0},
     {"take", 'd', "DIR", 0, "an existing take instead", 0},
     {"takes", 'D', "DIR", 0, "where synthetic ones are made and kept (build/stability/takes)", 0},
@@ -337,6 +342,7 @@ static error_t parse_option(int key, char *text, struct argp_state *state)
     case 'k': settings.n_seeds = (int)argument_integer(state, "--seeds", text, 0, 1000); return 0;
     case 'v': settings.size.n_views = (int)argument_integer(state, "--views", text, 8, 85); return 0;
     case 't': settings.size.texture = (int)argument_integer(state, "--texture", text, 8, 1024); return 0;
+    case 'i': settings.size.thin = (int)argument_integer(state, "--thin", text, 1, 64); return 0;
     case 'l': settings.size.n_lights = argument_power_of_two(state, "--lights", text, 1024); return 0;
     case 'u': settings.size.n_sub = argument_power_of_two(state, "--sub-lights", text, 64); return 0;
     case 'T': settings.synth.n_true_lights = (int)argument_integer(state, "--true-lights", text, 16, 65536); return 0;
@@ -357,7 +363,7 @@ int main(int argc, char **argv)
     char take[MAX_SETS][PATH_MAX] = {{0}};
     settings.synth = synth_defaults(2);
     settings.synth.n_true_lights = 4096, settings.synth.panorama_width_px = 512, settings.synth.texture_size = 128;
-    settings.synth.width_px = 180, settings.synth.height_px = 120, settings.synth.samples = 1;
+    settings.synth.width_px = 240, settings.synth.height_px = 160, settings.synth.samples = 1;
     argp_err_exit_status = 2;
     argp_parse(&argp, argc, argv, 0, NULL, NULL);
     if (settings.n_workers < 1)
@@ -379,8 +385,8 @@ int main(int argc, char **argv)
     for (int set = 0; !settings.take && set < MAX_SETS; set++)
         if (listed(settings.sets, set ? "D3" : "D2") && make_take(take[set], set + 2))
             return EXIT_FAILURE;
-    fprintf(stderr, "stability: %d runs of %d views %dx%d, texture %d, %d lights x %d, %d true lights; %d at a time\n", n,
-            settings.size.n_views, settings.synth.width_px, settings.synth.height_px, settings.size.texture, settings.size.n_lights,
+    fprintf(stderr, "stability: %d runs of %d views %dx%d, texture %d (one texel of %d x %d), %d lights x %d, %d true lights; %d at a time\n", n,
+            settings.size.n_views, settings.synth.width_px, settings.synth.height_px, settings.size.texture, settings.size.thin, settings.size.thin, settings.size.n_lights,
             settings.size.n_sub, settings.synth.n_true_lights, settings.n_workers);
     print_header();
     fflush(stdout);
