@@ -4,6 +4,7 @@
 // atlas, right and below, in one chart.
 #include "solver/misfit.h"
 
+#include "solver/lm.h"
 #include "solver/vec3.h"
 
 #include <errno.h>
@@ -14,6 +15,7 @@
 // Equal areas: bands of equal height on the sphere, cut into equal longitudes.
 enum { N_BANDS = 8, N_LONGITUDES = 16, N_BINS = N_BANDS * N_LONGITUDES };
 enum { APART = 32 }; // pairs are this part of the texture apart
+static const double CERTAIN = 3; // standard deviations: less may be chance
 
 struct bin {
     double sum[3], n;
@@ -88,9 +90,10 @@ static void measure_pairs(struct misfit *out, const struct photometric *p, const
                 add_pair(p->samples, r, a, b, &shared, &own, &out->n_pairs);
         }
     }
-    const double scale = out->n_pairs ? 1 / (3 * (double)out->n_pairs) : 0;
-    out->structure = sqrt(fmax(shared * scale, 0));
-    out->noise = sqrt(fmax((own - shared) * scale, 0));
+    const double n = 3 * (double)out->n_pairs, scale = n > 0 ? 1 / n : 0;
+    const double noise2 = fmax((own - shared) * scale, 0), chance = n > 0 ? noise2 / sqrt(n) : 0; // of white noise's covariance
+    out->structure = sqrt(fmax(shared * scale - CERTAIN * chance, 0));
+    out->noise = sqrt(noise2);
 }
 
 int misfit_measure(struct misfit *out, const struct photometric *p, const struct photometric_state *s)
@@ -142,5 +145,102 @@ int misfit_measure(struct misfit *out, const struct photometric *p, const struct
 end:
     free(r);
     free(by_view);
+    return err;
+}
+
+enum { PATCHES = 6, N_PATCHES = PATCHES * PATCHES }; // of the texture
+
+static int by_double(const void *a, const void *b)
+{
+    const double x = *(const double *)a, y = *(const double *)b;
+    return (x > y) - (x < y);
+}
+
+// A of all, and g of every patch that has any; *n of them.
+static int pull_of_patches(double *A, double *g, int *n, const struct photometric *p, const struct photometric_state *s,
+                           const unsigned char *is_free, size_t n_unknowns)
+{
+    const struct texels *t = p->texels;
+    struct photometric patch = *p;
+    uint8_t *use = malloc((size_t)t->n + 1);
+    int err = use ? 0 : -ENOMEM;
+    patch.use_texel = use;
+    *n = 0;
+    for (int k = 0; !err && k < N_PATCHES; k++) {
+        double *pull = g + (size_t)*n * n_unknowns, most = 0;
+        for (int i = 0; i < t->n; i++) {
+            const int x = (int)t->pixel[i] % t->size * PATCHES / t->size, y = (int)t->pixel[i] / t->size * PATCHES / t->size;
+            use[i] = y * PATCHES + x == k && (!p->use_texel || p->use_texel[i]);
+        }
+        err = photometric_normal_equations(&patch, s, is_free, A, pull);
+        for (size_t i = 0; i < n_unknowns; i++)
+            most = fmax(most, fabs(pull[i]));
+        *n += most > 0;
+    }
+    free(use);
+    return err;
+}
+
+// Median over the distances of (variance by patches) / (variance of independent samples); C = A^-1.
+static double inflation_of(const double *C, const double *g, int n_patches, double sigma2, const unsigned char *used,
+                           const struct photometric_layout *l)
+{
+    const size_t n = (size_t)l->n;
+    double ratio[l->n_groups], mean[n];
+    int m = 0;
+    for (size_t j = 0; j < n; j++) {
+        mean[j] = 0;
+        for (int k = 0; k < n_patches; k++)
+            mean[j] += g[(size_t)k * n + j] / n_patches;
+    }
+    for (int group = 0; group < l->n_groups; group++) {
+        const size_t i = (size_t)(l->inverse_distance + group);
+        double sum = 0;
+        for (int k = 0; used[i] && k < n_patches; k++) {
+            double step = 0;
+            for (size_t j = 0; j < n; j++)
+                step += C[i * n + j] * (g[(size_t)k * n + j] - mean[j]);
+            sum += step * step;
+        }
+        if (used[i])
+            ratio[m++] = sum * n_patches / (n_patches - 1) / (sigma2 * C[i * n + i]);
+    }
+    qsort(ratio, (size_t)m, sizeof(double), by_double);
+    return m && ratio[m / 2] > 1 ? ratio[m / 2] : 1;
+}
+
+int misfit_deviations(double *deviation, double *inflation, const struct photometric *p, const struct photometric_state *s,
+                      const unsigned char *is_free, const double *prior)
+{
+    const struct photometric_layout l = photometric_layout_of(p->samples->n_views, p->n_groups);
+    const size_t n = (size_t)l.n;
+    double *A = calloc(n * n, sizeof(double)), *C = calloc(n * n, sizeof(double)), *g = calloc(N_PATCHES * n, sizeof(double));
+    unsigned char used[n];
+    struct photometric_error e = { 0 };
+    int n_patches = 0, singular = 0;
+    int err = A && C && g ? pull_of_patches(A, g, &n_patches, p, s, is_free, n) : -ENOMEM;
+    if (!err)
+        err = photometric_evaluate(p, (struct photometric_state *)s, false, &e);
+    if (err)
+        goto end;
+    const double sigma2 = 2 * e.cost / fmax(3 * (double)e.n, 1);
+    for (size_t i = 0; i < n; i++) {
+        used[i] = is_free[i] && A[i * n + i] > 0;
+        A[i * n + i] *= 1 + 1e-12;
+    }
+    *inflation = 1;
+    singular = lm_inverse(l.n, A, used, C);
+    if (!singular && n_patches > 1 && sigma2 > 0)
+        *inflation = inflation_of(C, g, n_patches, sigma2, used, &l);
+    if (singular != -ENOMEM && prior && sigma2 > 0) {
+        for (size_t i = 0; i < n * n; i++)
+            A[i] += *inflation * sigma2 * prior[i];
+        singular = lm_inverse(l.n, A, used, C);
+    }
+    err = singular == -ENOMEM ? -ENOMEM : 0;
+    for (size_t i = 0; !err && i < n; i++)
+        deviation[i] = !used[i] ? INFINITY : singular ? NAN : sqrt(*inflation * sigma2 * C[i * (n + 1)]);
+end:
+    free(A), free(C), free(g);
     return err;
 }

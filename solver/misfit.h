@@ -14,7 +14,7 @@ struct misfit {
     double level;          // RMS of the pictures (1: white) over the samples looked at, all channels
     double residual;       // RMS of the residuals
     double noise;          // that part of it which neighbours do not share
-    double structure;      // that which they do; 0 where they share nothing
+    double structure;      // that which they do, beyond what chance gives; 0 where they share nothing
     double by_view;        // RMS of the views' means, noise taken off: exposures, a camera that moved
     double by_normal;      // of the means over like normals: light of a broad lobe
     double by_mirror;      // of the means over like mirrored view directions: highlights
@@ -23,3 +23,12 @@ struct misfit {
 
 // At the state with its albedo, over the views and texels in use and what did not clip. 0 or -ENOMEM. Pure: same in, same out.
 int misfit_measure(struct misfit *out, const struct photometric *p, const struct photometric_state *s);
+
+// Standard deviations of the unknowns (photometric_layout; [n]) that know of structure. sigma^2 A^-1 takes every sample for an
+// independent draw. Here the texture is cut into patches, and each patch's pull on the unknowns is one draw: what neighbours share
+// does not average out inside it. How much larger the distances' variances come out so (the median, at least 1) is *inflation;
+// C = (A / (inflation sigma^2) + prior)^-1. prior [n][n], or NULL: what is known beside the pictures, as a precision (E_sim: 1
+// beside 1 / |dh_i - dh_j|^2 is a wall seen at 45 degrees; not the weight of a regularisation, that is chosen for the estimate).
+// Infinite where nothing depends on an unknown; NAN where the matrix is singular. 0 or -ENOMEM.
+int misfit_deviations(double *deviation, double *inflation, const struct photometric *p, const struct photometric_state *s,
+                      const unsigned char *is_free, const double *prior);

@@ -42,6 +42,7 @@ struct stability_result {
     double centre_cm, rotation_deg, theta_worst; // of all but clearcoatGloss
     double rmse_fit_percent, rmse_held_out_percent, clipped_percent, seconds;
     struct misfit misfit;
+    double said_percent[2], patches_percent[2], inflation; // median and mean standard deviation of the distances: joint's, and of misfit.h
     int n_jacobians;
     char stop[24];
 };
@@ -459,18 +460,87 @@ static inline struct joint_settings stability_settings(const struct studio *s, c
     return set;
 }
 
-static inline int stability_measure_misfit(struct misfit *out, const struct input *in, const struct studio *s,
+static inline int stability_by_double(const void *a, const void *b)
+{
+    const double x = *(const double *)a, y = *(const double *)b;
+    return (x > y) - (x < y);
+}
+
+// Of the lights that shine: deviation of 1/r over 1/r, median and mean, in percent.
+static inline void stability_spread(double percent[2], const struct lights *l, int n_groups, const double *deviation)
+{
+    double relative[n_groups], sum = 0;
+    int n = 0;
+    for (int g = 0, run = l->n / n_groups; g < n_groups; g++)
+        if (isfinite(deviation[g]) && l->inverse_distance[g * run] > 0)
+            sum += relative[n++] = 100 * deviation[g] / l->inverse_distance[g * run];
+    qsort(relative, (size_t)n, sizeof(double), stability_by_double);
+    percent[0] = n ? relative[n / 2] : NAN, percent[1] = n ? sum / n : NAN;
+}
+
+// Eq. 11 in log 1/r as knowledge: neighbours' distances differ as along a wall seen at 45 degrees.
+static inline void stability_prior(double *prior, const struct lights *l, int n_groups, const struct photometric_layout *layout)
+{
+    enum { N_NEIGHBOURS = 8 };
+    const int run = l->n / n_groups;
+    double dir[n_groups][3];
+    memset(dir, 0, sizeof(dir));
+    for (int i = 0; i < l->n; i++)
+        vec3_add_scaled(dir[i / run], dir[i / run], judge_light_luminance(l, i), l->dir_probe[i]);
+    for (int i = 0; i < n_groups; i++)
+        vec3_normalise(dir[i]);
+    for (int i = 0; i < n_groups; i++) {
+        bool taken[n_groups];
+        memset(taken, 0, sizeof(taken));
+        for (int k = 0; k < N_NEIGHBOURS && k < n_groups - 1; k++) {
+            int nearest = -1;
+            for (int j = 0; j < n_groups; j++)
+                if (j != i && !taken[j] && (nearest < 0 || vec3_dot(dir[i], dir[j]) > vec3_dot(dir[i], dir[nearest])))
+                    nearest = j;
+            taken[nearest] = true;
+            double off[3];
+            vec3_sub(off, dir[i], dir[nearest]);
+            const double qi = l->inverse_distance[i * run], qj = l->inverse_distance[nearest * run];
+            const double w = 1 / fmax(vec3_dot(off, off), 1e-6) / N_NEIGHBOURS;
+            const size_t n = (size_t)layout->n, a = (size_t)(layout->inverse_distance + i), b = (size_t)(layout->inverse_distance + nearest);
+            if (!(qi > 0 && qj > 0))
+                continue;
+            prior[a * n + a] += w / (qi * qi), prior[b * n + b] += w / (qj * qj);
+            prior[a * n + b] -= w / (qi * qj), prior[b * n + a] -= w / (qi * qj);
+        }
+    }
+}
+
+static inline int stability_measure_misfit(struct stability_result *out, const struct input *in, const struct studio *s,
                                            const struct joint_settings *set, const struct joint_result *r, int n_threads)
 {
-    uint8_t *fit = malloc((size_t)s->cameras.n);
-    int32_t *group = calloc((size_t)in->lights.n, sizeof(*group));
+    const int n_groups = s->size.n_lights;
+    const struct photometric_layout layout = photometric_layout_of(s->cameras.n, n_groups);
+    uint8_t fit[s->cameras.n];
+    unsigned char is_free[layout.n];
+    double deviation[layout.n];
     const struct photometric p = {.texels = &in->texels, .samples = &in->samples, .model = set->model,
-                                  .variant = set->variant, .albedo = set->albedo, .group_of_light = group,
-                                  .n_groups = 1, .use_view = fit, .texel_step = 1, .n_threads = n_threads};
-    for (int v = 0; fit && v < s->cameras.n; v++)
+                                  .variant = set->variant, .albedo = set->albedo, .group_of_light = in->lights.group,
+                                  .n_groups = n_groups, .use_view = fit, .texel_step = 1, .n_threads = n_threads};
+    for (int v = 0; v < s->cameras.n; v++)
         fit[v] = !in->held_out[v];
-    const int err = fit && group ? misfit_measure(out, &p, &r->state) : -ENOMEM;
-    free(fit), free(group);
+    memset(is_free, 1, sizeof(is_free));
+    memset(is_free + layout.theta, !s->diffuse, DISNEY_N);
+    memset(is_free + layout.albedo, 0, 3);
+    memset(is_free + layout.gain, set->gain, (size_t)layout.n_views);
+    int err = misfit_measure(&out->misfit, &p, &r->state);
+    double *prior = calloc((size_t)layout.n * (size_t)layout.n, sizeof(*prior));
+    if (!err && !prior)
+        err = -ENOMEM;
+    if (!err)
+        stability_prior(prior, &r->state.lights, n_groups, &layout);
+    if (!err)
+        err = misfit_deviations(deviation, &out->inflation, &p, &r->state, is_free, prior);
+    free(prior);
+    if (!err) {
+        stability_spread(out->said_percent, &r->state.lights, n_groups, r->inverse_distance_std);
+        stability_spread(out->patches_percent, &r->state.lights, n_groups, deviation + layout.inverse_distance);
+    }
     return err;
 }
 
@@ -521,7 +591,7 @@ static inline void stability_run(struct stability_result *out, const struct stud
         out->must_doubt = p->mirrored || (p->missing >= 0 && p->missing < STRONGEST_LIGHT_MISSING);
         out->err = stability_judge(out, &in, s, &r, stability_n_sub(s, p->method));
         if (!out->err)
-            out->err = stability_measure_misfit(&out->misfit, &in, s, &set, &r, n_threads);
+            out->err = stability_measure_misfit(out, &in, s, &set, &r, n_threads);
         out->success = out->distance_percent < stability_success_percent;
         joint_result_free(&r);
     }

@@ -162,7 +162,8 @@ static void print_header(void)
     printf("set,axis,value,value2,seed,method,outcome,success,trusted,doubts,distance_percent,distance_median_percent,"
            "distance_weighted_percent,distance_weighted_median_percent,centre_cm,rotation_deg,theta_worst,rmse_fit_percent,"
            "rmse_held_out_percent,n_jacobians,seconds,stop,start_m,start_rotation_deg,start_centre_m,clipped_percent,"
-           "level_percent,residual_percent,noise_percent,structure_percent,by_view_percent,by_normal_percent,by_mirror_percent\n");
+           "level_percent,residual_percent,noise_percent,structure_percent,by_view_percent,by_normal_percent,by_mirror_percent,"
+           "said_median_percent,said_mean_percent,patches_median_percent,patches_mean_percent,inflation\n");
 }
 
 static void print_row(const struct plan *plan, const struct stability_result *r)
@@ -184,8 +185,9 @@ static void print_row(const struct plan *plan, const struct stability_result *r)
            r->rotation_deg, r->theta_worst, r->rmse_fit_percent, r->rmse_held_out_percent, r->n_jacobians, r->seconds, r->stop,
            plan->p.start_m, plan->p.rotation_deg, plan->p.centre_m, r->clipped_percent);
     const struct misfit *m = &r->misfit;
-    printf(",%.4g,%.4g,%.4g,%.4g,%.4g,%.4g,%.4g\n", 100 * m->level, 100 * m->residual, 100 * m->noise, 100 * m->structure,
-           100 * m->by_view, 100 * m->by_normal, 100 * m->by_mirror);
+    printf(",%.4g,%.4g,%.4g,%.4g,%.4g,%.4g,%.4g,%.4g,%.4g,%.4g,%.4g,%.4g\n", 100 * m->level, 100 * m->residual, 100 * m->noise, 100 * m->structure,
+           100 * m->by_view, 100 * m->by_normal, 100 * m->by_mirror, r->said_percent[0],
+           r->said_percent[1], r->patches_percent[0], r->patches_percent[1], r->inflation);
 }
 
 // ---- takes and workers --------------------------------------------------------------------------
