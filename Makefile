@@ -39,7 +39,7 @@ KERNELS := $(addprefix solver/kernels/,kernels.c kernels_ref.c kernels_portable.
 COMMANDS := $(addprefix solver/commands/,arguments.c brdf.c compare.c inputs.c lights.c output.c render.c solve.c synth.c visibility.c)
 LIBRARY := $(TAKE) $(SOLVER) $(KERNELS)
 FUZZED := $(TAKE) $(addprefix solver/,cameras.c cameras_colmap.c csv.c lights.c mesh.c mesh_import.c orientation.c panorama.c parallel.c texels.c)
-TESTS := $(addprefix test_,brdf cameras compare csv disney image joint json judge lights lm mesh normal_equations orientation panorama parallel pcg photometric rays render samples shapes synth take texels vec3 visibility) check_kernels
+TESTS := $(addprefix test_,brdf cameras compare csv disney image joint json judge lights lm mesh misfit normal_equations orientation panorama parallel pcg photometric rays render samples shapes stability synth take texels vec3 visibility) check_kernels
 FUZZERS := cameras csv exr hdr json lights mesh
 
 # ---- rules --------------------------------------------------------------------------------------------------------------
@@ -127,9 +127,12 @@ experiments: deps $(BUILD)/bin/rigsolve $(BUILD)/tests/bench/judge
 chart: deps deps-bench $(BUILD)/tests/bench/chart_lights
 	@mkdir -p build/chart && $(BUILD)/tests/bench/chart_lights >build/chart/lights.csv && gnuplot -e "out='build/chart/lights'" tests/bench/chart_lights.gp
 	@echo "chart: build/chart/lights.csv .svg .png: seconds against error over N, roughness and kernel"
-stability: deps deps-bench $(BUILD)/tests/bench/stability_kernels
+STABILITY_OPTIONS ?=
+stability: deps deps-bench $(BUILD)/tests/bench/stability_kernels $(BUILD)/tests/bench/stability_joint
 	@mkdir -p build/stability && $(BUILD)/tests/bench/stability_kernels >build/stability/kernels.csv && gnuplot -e "out='build/stability/kernels'" tests/bench/stability_kernels.gp
 	@echo "stability: build/stability/kernels.csv .svg .png: where float32 fails, over roughness and elevation"
+	@$(BUILD)/tests/bench/stability_joint $(STABILITY_OPTIONS) >build/stability/joint.csv && gnuplot -e "out='build/stability/joint'" tests/bench/stability_joint.gp
+	@echo "stability: build/stability/joint.csv .svg .png: where the lights are found, where not, and whether the solver says so"
 
 # ---- installation ---------------------------------------------------------------------------------------------------------
 MAN := $(addprefix $(BUILD)/man/rigsolve,.1 $(addprefix -,$(addsuffix .1,$(filter-out arguments inputs output,$(notdir $(COMMANDS:.c=))))))

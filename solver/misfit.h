@@ -8,6 +8,7 @@
 // the panorama leaves a bright spot there), and over the surface normal.
 #pragma once
 #include "solver/photometric.h"
+#include <stdbool.h>
 
 struct misfit {
     int64_t n_samples, n_pairs;
@@ -23,6 +24,14 @@ struct misfit {
 
 // At the state with its albedo, over the views and texels in use and what did not clip. 0 or -ENOMEM. Pure: same in, same out.
 int misfit_measure(struct misfit *out, const struct photometric *p, const struct photometric_state *s);
+
+// Is the structure more than MISFIT_POOR of the light? Clean synthetic studios leave .002 to .005, cameras half a pixel off or
+// millimetres of wrong geometry .015, a missing panel .02 to .06 (`make stability`, axis "missing").
+static const double MISFIT_POOR = .015;
+static inline bool misfit_is_poor(const struct misfit *m)
+{
+    return m->structure > MISFIT_POOR * m->level;
+}
 
 // Standard deviations of the unknowns (photometric_layout; [n]) that know of structure. sigma^2 A^-1 takes every sample for an
 // independent draw. Here the texture is cut into patches, and each patch's pull on the unknowns is one draw: what neighbours share

@@ -22,6 +22,7 @@ struct perturbation {
     uint64_t seed;
     enum method method;
     double start_m;                  // of every light; 0: the method's own
+    double w_sim;                    // the last; 0: the method's own
     double rotation_deg, centre_m;   // of the start from the truth; axis and direction are random
     double noise;                    // standard deviation of every sample, of white
     double camera_px;                // of every camera's pose, as it moves the picture
@@ -40,7 +41,7 @@ struct stability_result {
     unsigned doubts;
     double distance_percent, distance_median_percent, distance_weighted_percent, distance_weighted_median_percent;
     double centre_cm, rotation_deg, theta_worst; // of all but clearcoatGloss
-    double rmse_fit_percent, rmse_held_out_percent, clipped_percent, seconds;
+    double rmse_fit_percent, rmse_held_out_percent, clipped_percent, seconds, w_sim;
     struct misfit misfit;
     double said_percent[2], patches_percent[2], inflation; // median and mean standard deviation of the distances: joint's, and of misfit.h
     int n_jacobians;
@@ -456,6 +457,8 @@ static inline struct joint_settings stability_settings(const struct studio *s, c
         set.given_albedo[c] = .5;
     if (p->start_m > 0)
         set.start_distance_m = p->start_m;
+    if (p->w_sim > 0)
+        set.w_sim = p->w_sim;
     set.gain = p->solve_gain, set.n_threads = n_threads;
     return set;
 }
@@ -586,7 +589,7 @@ static inline void stability_run(struct stability_result *out, const struct stud
         out->doubts = r.doubts, out->trusted = !r.doubts;
         out->rmse_fit_percent = r.rmse_fit_percent, out->rmse_held_out_percent = r.rmse_held_out_percent;
         out->clipped_percent = 100 * in.samples.clipped_share;
-        out->n_jacobians = r.n_jacobians;
+        out->n_jacobians = r.n_jacobians, out->w_sim = r.w_sim;
         snprintf(out->stop, sizeof(out->stop), "%s", r.stop_reason);
         out->must_doubt = p->mirrored || (p->missing >= 0 && p->missing < STRONGEST_LIGHT_MISSING);
         out->err = stability_judge(out, &in, s, &r, stability_n_sub(s, p->method));

@@ -19,7 +19,7 @@ enum { MAX_VALUES = 10, MAX_SETS = 2, MAX_WORKERS = 64 };
 // ---- what is tried ------------------------------------------------------------------------------
 
 enum axis_id {
-    AXIS_START, AXIS_ROTATION, AXIS_CENTRE, AXIS_NOISE, AXIS_CAMERA, AXIS_BUMPS, AXIS_ROUGHNESS, AXIS_VIEWS, AXIS_GAIN,
+    AXIS_START, AXIS_W_SIM, AXIS_ROTATION, AXIS_CENTRE, AXIS_NOISE, AXIS_CAMERA, AXIS_BUMPS, AXIS_ROUGHNESS, AXIS_VIEWS, AXIS_GAIN,
     AXIS_GAIN_SOLVED, AXIS_CLIPPED, AXIS_MOVED, AXIS_MISSING, AXIS_MIRRORED, N_SINGLE, AXIS_MAP = N_SINGLE, AXIS_RANDOM, N_AXES
 };
 
@@ -30,6 +30,7 @@ static const struct axis {
     bool too_alternating;
 } axes[N_AXES] = {
     [AXIS_START] = {"start_m", 8, {0, .5, .7, 1, 1.5, 2.5, 4, 6}, false}, // 0: its own sweep
+    [AXIS_W_SIM] = {"w_sim", 9, {1e-4, 1e-5, 1e-6, 1e-7, 1e-8, 1e-9, 1e-10, 1e-11, 1e-12}, false},
     [AXIS_ROTATION] = {"rotation_deg", 6, {0, 4, 8, 12, 16, 20}, true},
     [AXIS_CENTRE] = {"centre_m", 6, {0, .2, .4, .6, .8, 1}, true},
     [AXIS_NOISE] = {"noise_percent", 6, {0, .3, 1, 2, 3, 5}, false},
@@ -90,6 +91,7 @@ static struct perturbation perturbation_of(enum axis_id axis, double v, double v
     struct perturbation p = careful(seed, method);
     switch (axis) {
     case AXIS_START: p.start_m = v; break;
+    case AXIS_W_SIM: p.w_sim = v; break;
     case AXIS_ROTATION: p.rotation_deg = v; break;
     case AXIS_CENTRE: p.centre_m = v; break;
     case AXIS_NOISE: p.noise = v / 100; break;
@@ -163,7 +165,7 @@ static void print_header(void)
            "distance_weighted_percent,distance_weighted_median_percent,centre_cm,rotation_deg,theta_worst,rmse_fit_percent,"
            "rmse_held_out_percent,n_jacobians,seconds,stop,start_m,start_rotation_deg,start_centre_m,clipped_percent,"
            "level_percent,residual_percent,noise_percent,structure_percent,by_view_percent,by_normal_percent,by_mirror_percent,"
-           "said_median_percent,said_mean_percent,patches_median_percent,patches_mean_percent,inflation\n");
+           "said_median_percent,said_mean_percent,patches_median_percent,patches_mean_percent,inflation,last_w_sim\n");
 }
 
 static void print_row(const struct plan *plan, const struct stability_result *r)
@@ -185,9 +187,9 @@ static void print_row(const struct plan *plan, const struct stability_result *r)
            r->rotation_deg, r->theta_worst, r->rmse_fit_percent, r->rmse_held_out_percent, r->n_jacobians, r->seconds, r->stop,
            plan->p.start_m, plan->p.rotation_deg, plan->p.centre_m, r->clipped_percent);
     const struct misfit *m = &r->misfit;
-    printf(",%.4g,%.4g,%.4g,%.4g,%.4g,%.4g,%.4g,%.4g,%.4g,%.4g,%.4g,%.4g\n", 100 * m->level, 100 * m->residual, 100 * m->noise, 100 * m->structure,
+    printf(",%.4g,%.4g,%.4g,%.4g,%.4g,%.4g,%.4g,%.4g,%.4g,%.4g,%.4g,%.4g,%.4g\n", 100 * m->level, 100 * m->residual, 100 * m->noise, 100 * m->structure,
            100 * m->by_view, 100 * m->by_normal, 100 * m->by_mirror, r->said_percent[0],
-           r->said_percent[1], r->patches_percent[0], r->patches_percent[1], r->inflation);
+           r->said_percent[1], r->patches_percent[0], r->patches_percent[1], r->inflation, r->w_sim);
 }
 
 // ---- takes and workers --------------------------------------------------------------------------
