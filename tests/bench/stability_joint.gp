@@ -11,7 +11,7 @@ awk(s, a, m) = sprintf("< awk -F, 'function med(k,  i,j,t,n){n=split(k,v,\" \");
 has(s, a, m) = int(system(sprintf("awk -F, '$1==\"%s\"&&$2==\"%s\"&&$6==\"%s\"{n++} END{print n+0}' %s", s, a, m, csv))) > 0
 sets = system("awk -F, 'NR>1&&!($1 in s){s[$1]; printf \"%s \", $1}' ".csv)
 colour(s) = s eq "D3" ? "#d7191c" : "#2c7bb6"
-map(s, m) = sprintf("< awk -F, '$1==\"%s\"&&$2==\"map\"&&$6==\"%s\"&&$7!=\"error\"{k=$3\",\"$4; n[k]++; e[k]+=log($11>0.1?($11<1000?$11:1000):0.1)} END{for(k in n) print k\",\"exp(e[k]/n[k])}' %s", s, m, csv)
+map(s, m) = sprintf("< awk -F, '$1==\"%s\"&&$2==\"map\"&&$6==\"%s\"&&$7!=\"error\"{k=$3\",\"$4; n[k]++; e[k]+=log($11>0.1?($11<1000?$11:1000):0.1)} END{for(k in n) print k\",\"exp(e[k]/n[k])}' %s | sort -t, -k2,2g -k1,1g", s, m, csv)
 headline = system("awk -F, '$2==\"random\"{k=$1\" \"$6; n[k]++; ok[k]+=$11<5; near[k]+=$12<5; bad[k]+=$7==\"dishonest\"} END{for(k in n) printf \"%s: %d of %d (median light: %d; failed and trusted: %d)\\n\", k, ok[k], n[k], near[k], bad[k]}' ".csv)
 worse = "missing mirrored"
 do for [term in "svg png"] {
