@@ -187,6 +187,32 @@ static void clipped_samples_are_left_out(void **state)
     assert_int_equal(found.n_samples, m->n - (m->n + 2) / 3);
 }
 
+static void views_left_out_are_not_looked_at(void **state)
+{
+    (void)state;
+    uint8_t even[N_VIEWS];
+    int64_t n = 0;
+    show(.01, 0, .02);
+    for (int v = 0; v < N_VIEWS; v++)
+        even[v] = v % 2 == 0;
+    for (int64_t i = 0; i < scene.samples.n; i++)
+        n += even[scene.samples.view[i]];
+    scene.p.use_view = even;
+    const struct misfit m = measure();
+    float(*r)[3] = malloc((size_t)scene.samples.n * sizeof(*r));
+    assert_non_null(r);
+    assert_int_equal(photometric_residuals(&scene.p, &scene.s, r), 0);
+    scene.p.use_view = NULL;
+    double mean = 0;
+    for (int64_t i = 0; i < scene.samples.n; i++) {
+        assert_int_equal(!isnan(r[i][0]), even[scene.samples.view[i]]);
+        mean += even[scene.samples.view[i]] ? (double)r[i][0] / (double)n : 0;
+    }
+    free(r);
+    assert_int_equal(m.n_samples, n);
+    near("L - o where the picture is darker", mean, .02, .001);
+}
+
 // ---- a light that the model lacks ---------------------------------------------------------------
 
 static void missing_light_is_poor_and_pointed_at(void **state)
@@ -274,6 +300,7 @@ int main(void)
         cmocka_unit_test(uneven_views_are_seen_by_view),
         cmocka_unit_test(exact_pictures_have_no_misfit),
         cmocka_unit_test(clipped_samples_are_left_out),
+        cmocka_unit_test(views_left_out_are_not_looked_at),
         cmocka_unit_test(missing_light_is_poor_and_pointed_at),
         cmocka_unit_test(noise_alone_inflates_nothing_and_halves_with_itself),
         cmocka_unit_test(structure_inflates),
