@@ -157,7 +157,7 @@ struct job {
     bool one_row;                 // diffuse, with neither gains nor albedos to find: a texel's views differ in a row's length only
     int *group_first;             // [n_groups + 1] where the lights of each group begin, when they are ascending and all groups are free; else NULL
     bool tinted;                  // the tint matters: solve the albedo twice
-    float (*residual)[3];         // [samples n] for the scale and the robust weights, or NULL
+    float (*residual)[3];         // [samples n] L - o, or NULL
 };
 
 static void job_free(struct job *j)
@@ -372,7 +372,7 @@ static void evaluate_texels(void *arg, int64_t begin, int64_t end, int worker, d
                 partial[0] += .5 * (double)o->weight * (double)r * (double)r;
                 partial[1] += (double)shown * (double)shown;
                 if (j->residual)
-                    j->residual[i][c] = fabsf(r);
+                    j->residual[i][c] = r;
             }
             partial[2] += 1;
         }
@@ -602,7 +602,15 @@ int photometric_normal_equations(const struct photometric *p, const struct photo
     return err;
 }
 
-// ---- robust weights -----------------------------------------------------------------------------------------------------
+// ---- residuals, robust weights -------------------------------------------------------------------------------------------
+
+int photometric_residuals(const struct photometric *p, const struct photometric_state *s, float (*residual)[3])
+{
+    struct photometric_error error;
+    for (int64_t i = 0; i < p->samples->n; i++)
+        residual[i][0] = residual[i][1] = residual[i][2] = NAN;
+    return evaluate(p, (struct photometric_state *)s, false, residual, &error);
+}
 
 static int by_float(const void *a, const void *b)
 {
@@ -610,54 +618,35 @@ static int by_float(const void *a, const void *b)
     return (x > y) - (x < y);
 }
 
-// |L - o| of every sample in use; -1 where it is not.
-static int residuals(const struct photometric *p, const struct photometric_state *s, float (**out)[3])
-{
-    struct photometric_error error;
-    float(*r)[3] = malloc((size_t)p->samples->n * sizeof(*r) + 1);
-    if (!r)
-        return -ENOMEM;
-    for (int64_t i = 0; i < p->samples->n; i++)
-        r[i][0] = r[i][1] = r[i][2] = -1;
-    const int err = evaluate(p, (struct photometric_state *)s, false, r, &error);
-    if (err)
-        free(r);
-    else
-        *out = r;
-    return err;
-}
-
 int photometric_scale(const struct photometric *p, const struct photometric_state *s, double *sigma)
 {
-    float(*r)[3];
-    const int err = residuals(p, s, &r);
-    if (err)
-        return err;
-    float *all = r[0];
-    int64_t n = 0;
-    for (int64_t i = 0; i < 3 * p->samples->n; i++)
-        if (all[i] >= 0)
-            all[n++] = all[i];
-    qsort(all, (size_t)n, sizeof(float), by_float);
-    *sigma = n ? 1.4826 * (double)all[n / 2] : 0;
+    float(*r)[3] = malloc((size_t)p->samples->n * sizeof(*r) + 1);
+    int err = r ? photometric_residuals(p, s, r) : -ENOMEM;
+    if (!err) {
+        float *all = r[0];
+        int64_t n = 0;
+        for (int64_t i = 0; i < 3 * p->samples->n; i++)
+            if (!isnan(all[i]))
+                all[n++] = fabsf(all[i]);
+        qsort(all, (size_t)n, sizeof(float), by_float);
+        *sigma = n ? 1.4826 * (double)all[n / 2] : 0;
+    }
     free(r);
-    return 0;
+    return err;
 }
 
 int photometric_robust_weights(const struct photometric *p, const struct photometric_state *s, double sigma,
                                const float *base, float *weight)
 {
-    float(*r)[3];
+    float(*r)[3] = malloc((size_t)p->samples->n * sizeof(*r) + 1);
     struct photometric plain = *p;
     plain.weight = NULL;
-    const int err = residuals(&plain, s, &r);
-    if (err)
-        return err;
-    for (int64_t i = 0; i < p->samples->n; i++) {
-        const float largest = fmaxf(fmaxf(r[i][0], r[i][1]), r[i][2]);
+    const int err = r ? photometric_residuals(&plain, s, r) : -ENOMEM;
+    for (int64_t i = 0; !err && i < p->samples->n; i++) {
+        const float largest = fmaxf(fmaxf(fabsf(r[i][0]), fabsf(r[i][1])), fabsf(r[i][2]));
         const double u = (double)largest / (sigma > 0 ? sigma : 1), w = 1 / (1 + u * u);
-        weight[i] = largest < 0 ? 0 : (float)(w * w) * (base ? base[i] : 1);
+        weight[i] = isnan(r[i][0]) ? 0 : (float)(w * w) * (base ? base[i] : 1);
     }
     free(r);
-    return 0;
+    return err;
 }
