@@ -405,8 +405,8 @@ static void fit_coats(struct gltf_brdf *b)
             target[i] = shown(ground / M_PI + f1[0] - f0[0], b->l[i][2]);
         }
         for (int r = 1; r <= 60; r++)
-            for (int s = 1; s <= 60; s++) {
-                const double roughness = r / 60., scale = s / 60., a = roughness * roughness;
+            for (int s = 1; s <= 60; s++) { // Disney's coat has a weight of .25
+                const double roughness = r / 60., scale = .25 * s / 60., a = roughness * roughness;
                 double error = 0;
                 for (int i = 0; i < GLTF_N_PAIRS && error < best; i++) {
                     struct cosines c;
