@@ -33,10 +33,10 @@ endif
 # ---- what is built ------------------------------------------------------------------------------------------------------
 TAKE := $(addprefix solver/take/,atomic_file.c image.c image_exr.c image_hdr.c image_png.c image_tiff.c json.c log.c progress.c take.c)
 SOLVER := $(addprefix solver/,cameras.c cameras_colmap.c compare.c csv.c disney.c export.c export_glb.c export_materialx.c export_obj.c gltf_brdf.c joint.c lights.c lm.c mesh.c mesh_import.c \
-  normal_equations.c orientation.c panorama.c parallel.c pcg.c photometric.c rays.c render.c samples.c shapes.c synth.c \
+  normal_equations.c orientation.c panorama.c parallel.c pcg.c photometric.c rays.c render.c report.c samples.c shapes.c synth.c \
   texels.c visibility.c)
 KERNELS := $(addprefix solver/kernels/,kernels.c kernels_ref.c kernels_portable.c kernels_avx2.c kernels_avx512.c)
-COMMANDS := $(addprefix solver/commands/,arguments.c brdf.c compare.c export.c inputs.c lights.c output.c render.c solve.c solved.c synth.c visibility.c)
+COMMANDS := $(addprefix solver/commands/,arguments.c brdf.c compare.c export.c inputs.c lights.c output.c render.c report.c solve.c solved.c synth.c visibility.c)
 LIBRARY := $(TAKE) $(SOLVER) $(KERNELS)
 FUZZED := $(TAKE) $(addprefix solver/,cameras.c cameras_colmap.c csv.c lights.c mesh.c mesh_import.c orientation.c panorama.c parallel.c texels.c)
 TESTS := $(addprefix test_,brdf cameras compare csv disney image joint json judge lights lm mesh normal_equations orientation panorama parallel pcg photometric rays render samples shapes synth take texels vec3 visibility) check_kernels

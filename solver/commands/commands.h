@@ -13,3 +13,4 @@ int command_synth(int argc, char **argv);
 int command_render(int argc, char **argv);
 int command_compare(int argc, char **argv);
 int command_export(int argc, char **argv);
+int command_report(int argc, char **argv);
