@@ -172,14 +172,16 @@ static int make_picture(struct export_job *job, int which, const struct texels *
             p->pixels[i][0] = 255, p->pixels[i][1] = 128; // along the tangent
     const size_t first = texels->pixel[0];
     p->constant = true;
-    for (int i = 0; i < texels->n; i++) {
-        const uint8_t *pixel = p->pixels[texels->pixel[i]];
-        p->constant = p->constant && !memcmp(pixel, p->pixels[first], 3);
-        for (int c = 0; c < 3; c++)
-            p->most[c] = pixel[c] > p->most[c] ? pixel[c] : p->most[c];
-    }
-    for (int c = 0; c < 3; c++)
+    for (int c = 0; c < 3; c++) {
+        p->channel_constant[c] = true;
+        for (int i = 0; i < texels->n; i++) {
+            const uint8_t byte = p->pixels[texels->pixel[i]][c];
+            p->channel_constant[c] = p->channel_constant[c] && byte == p->pixels[first][c];
+            p->most[c] = byte > p->most[c] ? byte : p->most[c];
+        }
+        p->constant = p->constant && p->channel_constant[c];
         p->value[c] = r->from[c] < 0 ? 0 : (double)fitted[first][r->from[c]];
+    }
     return 0;
 }
 

@@ -8,7 +8,7 @@ enum { PICTURE_BASE, PICTURE_METALLIC_ROUGHNESS, PICTURE_SPECULAR, PICTURE_COAT,
 struct export_picture {
     uint8_t (*pixels)[3]; // [size * size], top row first: base, specular, sheen sRGB-encoded; metallic-roughness (0, roughness,
                           // metallic), coat (factor, roughness, 0), anisotropy (direction 255, 128; strength) linear
-    bool constant;
+    bool constant, channel_constant[3]; // all three; each
     double value[3]; // the constant, linear, not rounded; specular: multiply by nothing
     uint8_t most[3]; // the largest bytes
 };

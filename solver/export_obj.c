@@ -78,8 +78,9 @@ static void write_material(FILE *f, const struct export_job *job)
             .04 * job->specular_factor * specular->value[2]);
     for (int i = 0; i < N_KEYS; i++) {
         const struct export_picture *p = &job->picture[keys[i].which];
-        fprintf(f, "%s %.6f\n", keys[i].value, p->constant ? p->value[keys[i].channel] : 1);
-        if (!p->constant)
+        const bool constant = p->channel_constant[keys[i].channel];
+        fprintf(f, "%s %.6f\n", keys[i].value, constant ? p->value[keys[i].channel] : 1);
+        if (!constant)
             fprintf(f, "%s %s\n", keys[i].map, keys[i].file);
     }
 }
@@ -116,7 +117,7 @@ int export_obj(struct export_job *job, bool with_material)
     if (!job->picture[PICTURE_BASE].constant)
         err = write_base(job);
     for (int i = 0; !err && i < N_KEYS; i++)
-        if (!job->picture[keys[i].which].constant)
+        if (!job->picture[keys[i].which].channel_constant[keys[i].channel])
             err = write_plane(job, keys[i].which, keys[i].channel, keys[i].file);
     return err ? err : write_text(job, "model.mtl", false, false);
 }

@@ -25,7 +25,7 @@ enum {
     N_GLOSS = 33,
     N_VIEWS = 4, N_PER_VIEW = GLTF_N_PAIRS / N_VIEWS,
 };
-static const double least_sheen_roughness = .07, largest_specular_color = 8;
+static const double least_sheen_roughness = .07, largest_specular_color = 25; // f0 = 1
 
 struct gltf_brdf {
     double sheen_e[N_SHEEN_ROUGHNESS][N_SHEEN_COS];
@@ -229,15 +229,11 @@ static void fit_lobes(const struct gltf_brdf *b, struct gltf_material *out, cons
 }
 
 // The base colour by least squares where neither picture clips; S keeps (1-m) .04 S + m C what it is.
-static void fit_base_color(const struct gltf_brdf *b, struct gltf_material *out, const struct disney *m,
+static void fit_base_color(const struct gltf_brdf *b, struct gltf_material *out, const double f0[3],
                            const double target[GLTF_N_PAIRS][3])
 {
-    const double metallic = out->metallic, dielectric = 1 - metallic;
-    double first[3], f0[3], sum[3] = { 0 }, square[3] = { 0 };
-    for (int k = 0; k < 3; k++) {
-        first[k] = clamp(m->albedo[k], 0, 1);
-        f0[k] = dielectric * .04 * out->specular_color[k] + metallic * first[k];
-    }
+    const double metallic = out->metallic, dielectric = 1 - metallic, *first = out->base_color;
+    double sum[3] = { 0 }, square[3] = { 0 };
     if (dielectric < 1e-3)
         return; // no diffuse to speak of
     for (int i = 0; i < GLTF_N_PAIRS; i++) {
@@ -286,14 +282,16 @@ static double squared_error(const struct gltf_brdf *b, const struct gltf_materia
 void gltf_from_disney(const struct gltf_brdf *b, struct gltf_material *out, const struct disney *m,
                       struct gltf_fit_error *error)
 {
-    double target[GLTF_N_PAIRS][3], tint[3];
+    double target[GLTF_N_PAIRS][3], tint[3], f0[3];
     struct gltf_material plain;
     for (int i = 0; i < GLTF_N_PAIRS; i++)
         disney_eval(m, &axes, b->l[i], b->v[i], target[i]);
     find_tint(m->albedo, tint);
     fit_lobes(b, out, m, tint);
+    for (int k = 0; k < 3; k++)
+        f0[k] = (1 - out->metallic) * .04 * out->specular_color[k] + out->metallic * out->base_color[k];
     for (int round = 0; round < 2; round++) // S decides what the diffuse lobe keeps, the base colour decides S
-        fit_base_color(b, out, m, (const double(*)[3])target);
+        fit_base_color(b, out, f0, (const double(*)[3])target);
     if (!error)
         return;
     gltf_from_disney_by_name(&plain, m);

@@ -57,13 +57,15 @@ static double number_of(const struct json *v, const char *path)
 
 // ---- pictures -------------------------------------------------------------------------------------------------------------
 
-int report_shrink(struct image *out, const struct image *image, int width, int height)
+// The same of n channels from the first on.
+static int shrink(struct image *out, const struct image *image, int first, int n, int width, int height)
 {
-    const int n = image->n_channels;
-    const int err = image_new(out, width, height, n, NULL);
+    const char *names[IMAGE_MAX_CHANNELS];
+    for (int c = 0; c < n; c++)
+        names[c] = image->names[first + c];
+    const int err = image_new(out, width, height, n, names);
     if (err)
         return err;
-    memcpy(out->names, image->names, (size_t)n * sizeof(*out->names));
     const double sx = (double)image->width / width, sy = (double)image->height / height;
     for (int y = 0; y < height; y++)
         for (int x = 0; x < width; x++) {
@@ -71,7 +73,7 @@ int report_shrink(struct image *out, const struct image *image, int width, int h
             for (int j = (int)(y * sy); j < image->height && j < (y + 1) * sy; j++)
                 for (int i = (int)(x * sx); i < image->width && i < (x + 1) * sx; i++) {
                     const double w = (fmin(i + 1, (x + 1) * sx) - fmax(i, x * sx)) * (fmin(j + 1, (y + 1) * sy) - fmax(j, y * sy));
-                    const float *p = image->data + ((size_t)j * (size_t)image->width + (size_t)i) * (size_t)n;
+                    const float *p = image->data + ((size_t)j * (size_t)image->width + (size_t)i) * (size_t)image->n_channels + first;
                     for (int c = 0; c < n; c++)
                         sum[c] += w * (double)p[c];
                 }
@@ -79,6 +81,11 @@ int report_shrink(struct image *out, const struct image *image, int width, int h
                 out->data[((size_t)y * (size_t)width + (size_t)x) * (size_t)n + (size_t)c] = (float)(sum[c] / (sx * sy));
         }
     return 0;
+}
+
+int report_shrink(struct image *out, const struct image *image, int width, int height)
+{
+    return shrink(out, image, 0, image->n_channels, width, height);
 }
 
 static uint8_t byte_of(double v)
@@ -205,18 +212,17 @@ static int put_map(FILE *f, const struct image *map, int channel, bool colour, d
     const int side = map->width < THUMBNAIL_PX ? map->width : THUMBNAIL_PX;
     char caption[256];
     uint8_t *bytes = NULL;
-    int err = report_shrink(&small, map, side, side);
+    const int n = colour ? 3 : 1;
+    int err = shrink(&small, map, channel, n, side, side);
     if (!err) {
-        bytes = malloc((size_t)side * (size_t)side * 3);
+        bytes = malloc((size_t)side * (size_t)side * (size_t)n);
         err = bytes ? 0 : -ENOMEM;
     }
-    for (size_t i = 0; !err && i < (size_t)side * (size_t)side; i++)
-        for (int c = 0; c < (colour ? 3 : 1); c++)
-            bytes[i * (colour ? 3 : 1) + (size_t)c] =
-                colour ? srgb_byte((double)pixel_of(&small, i)[c] / most) : byte_of((double)pixel_of(&small, i)[channel] / most);
+    for (size_t i = 0; !err && i < (size_t)side * (size_t)side * (size_t)n; i++)
+        bytes[i] = colour ? srgb_byte((double)small.data[i] / most) : byte_of((double)small.data[i] / most);
     snprintf(caption, sizeof(caption), "%s<br><small>%s</small>", name, note);
     if (!err)
-        err = put_figure(f, "map", side, side, colour ? 3 : 1, bytes, name, caption);
+        err = put_figure(f, "map", side, side, n, bytes, name, caption);
     free(bytes);
     image_free(&small);
     return err;

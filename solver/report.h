@@ -30,5 +30,5 @@ struct report_source {
 // Atomic. 0, -errno (logged), -ENOMEM.
 int report_write(const struct report_source *source, const char *path);
 
-// Area mean of an image's first n_channels at another size, no larger. 0 or -ENOMEM.
+// Area mean of an image at another size, no larger. 0 or -ENOMEM.
 int report_shrink(struct image *out, const struct image *image, int width, int height);
