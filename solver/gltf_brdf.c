@@ -27,9 +27,21 @@ enum {
 };
 static const double least_sheen_roughness = .07, largest_specular_color = 25; // f0 = 1
 
+// What the directions enter with.
+struct cosines {
+    double nl, nv, nh, vh, lx, ly, vx, vy, hx, hy;
+};
+
+// What sheen of one roughness does there: its lobe, and the larger of E(<n,v>) and E(<n,l>).
+struct sheen {
+    double lobe, taken;
+};
+
 struct gltf_brdf {
     double sheen_e[N_SHEEN_ROUGHNESS][N_SHEEN_COS];
-    double l[GLTF_N_PAIRS][3], v[GLTF_N_PAIRS][3];
+    double l[GLTF_N_PAIRS][3], v[GLTF_N_PAIRS][3]; // the fixed pairs, and what of them does not depend on a material
+    struct cosines pair[GLTF_N_PAIRS];
+    struct sheen pair_sheen[GLTF_N_PAIRS]; // of sheen_roughness
     double coat_roughness[N_GLOSS], coat_scale[N_GLOSS];
     double sheen_roughness, sheen_scale;
 };
@@ -58,11 +70,6 @@ static double fifth_power_below(double u)
 }
 
 // ---- the model ------------------------------------------------------------------------------------------------------------
-
-// What the directions enter with.
-struct cosines {
-    double nl, nv, nh, vh, lx, ly, vx, vy, hx, hy;
-};
 
 static bool find_cosines(struct cosines *c, const struct disney_frame *frame, const double l[3], const double v[3])
 {
@@ -124,12 +131,18 @@ static double sheen_albedo(const struct gltf_brdf *b, double cosine, double roug
                y - j);
 }
 
+static void find_sheen(struct sheen *out, const struct gltf_brdf *b, const struct cosines *c, double roughness)
+{
+    out->lobe = sheen_lobe(c, roughness);
+    out->taken = fmax(sheen_albedo(b, c->nv, roughness), sheen_albedo(b, c->nl, roughness));
+}
+
 // f_k = constant_k + diffuse_k C_k + metal_k C_k: the base colour enters linearly.
 struct split {
     double constant[3], diffuse, metal;
 };
 
-static void split_eval(const struct gltf_brdf *b, const struct gltf_material *m, const struct cosines *c, struct split *out)
+static void split_eval(const struct gltf_material *m, const struct cosines *c, const struct sheen *at, struct split *out)
 {
     const double alpha = m->roughness * m->roughness, alpha_x = mix(alpha, 1, m->anisotropy * m->anisotropy);
     const double gd = ggx(c, alpha_x, alpha), rise = fifth_power_below(c->vh);
@@ -148,9 +161,8 @@ static void split_eval(const struct gltf_brdf *b, const struct gltf_material *m,
     const double sheen_max = max3(m->sheen_color);
     double sheen = 0, scale = below;
     if (sheen_max > 0) {
-        sheen = below * sheen_lobe(c, m->sheen_roughness);
-        scale *= fmax(0, 1 - sheen_max * fmax(sheen_albedo(b, c->nv, m->sheen_roughness),
-                                              sheen_albedo(b, c->nl, m->sheen_roughness)));
+        sheen = below * at->lobe;
+        scale *= fmax(0, 1 - sheen_max * at->taken);
     }
     out->diffuse = scale * (1 - m->metallic) * (1 - m->specular * max3(fr)) / M_PI;
     out->metal = scale * m->metallic * (1 - rise) * gd;
@@ -163,11 +175,14 @@ void gltf_brdf_eval(const struct gltf_brdf *b, const struct gltf_material *m, co
                     const double l[3], const double v[3], double f[3])
 {
     struct cosines c;
+    struct sheen at = { 0 };
     struct split s;
     f[0] = f[1] = f[2] = 0;
     if (!find_cosines(&c, frame, l, v))
         return;
-    split_eval(b, m, &c, &s);
+    if (max3(m->sheen_color) > 0)
+        find_sheen(&at, b, &c, m->sheen_roughness);
+    split_eval(m, &c, &at, &s);
     for (int k = 0; k < 3; k++)
         f[k] = s.constant[k] + (s.diffuse + s.metal) * m->base_color[k];
 }
@@ -237,17 +252,15 @@ static void fit_base_color(const struct gltf_brdf *b, struct gltf_material *out,
     if (dielectric < 1e-3)
         return; // no diffuse to speak of
     for (int i = 0; i < GLTF_N_PAIRS; i++) {
-        struct cosines c;
+        const double nl = b->pair[i].nl;
         struct split s;
-        if (!find_cosines(&c, &axes, b->l[i], b->v[i]))
-            continue;
-        split_eval(b, out, &c, &s);
+        split_eval(out, &b->pair[i], &b->pair_sheen[i], &s);
         for (int k = 0; k < 3; k++) {
             const double rest = s.constant[k] + s.metal * first[k]; // what F0 decides, whoever carries it
-            if (M_PI * c.nl * fmax(target[i][k], rest + s.diffuse * first[k]) >= 1)
+            if (M_PI * nl * fmax(target[i][k], rest + s.diffuse * first[k]) >= 1)
                 continue;
-            sum[k] += c.nl * c.nl * s.diffuse * (target[i][k] - rest);
-            square[k] += c.nl * c.nl * s.diffuse * s.diffuse;
+            sum[k] += nl * nl * s.diffuse * (target[i][k] - rest);
+            square[k] += nl * nl * s.diffuse * s.diffuse;
         }
     }
     for (int k = 0; k < 3; k++) {
@@ -335,6 +348,8 @@ static void make_pairs(struct gltf_brdf *b)
                 if (l[2] < .02)
                     continue; // below the horizon: the next one
             }
+            if (!find_cosines(&b->pair[n], &axes, l, v))
+                continue;
             memcpy(b->l[n], l, sizeof(l)), memcpy(b->v[n], v, sizeof(v));
             n++;
         }
@@ -407,11 +422,9 @@ static void fit_coats(struct gltf_brdf *b)
                 const double roughness = r / 60., scale = .25 * s / 60., a = roughness * roughness;
                 double error = 0;
                 for (int i = 0; i < GLTF_N_PAIRS && error < best; i++) {
-                    struct cosines c;
-                    if (!find_cosines(&c, &axes, b->l[i], b->v[i]))
-                        continue;
-                    const double share = scale * (.04 + .96 * fifth_power_below(c.nv));
-                    const double d = shown(ground / M_PI + share * ggx(&c, a, a), c.nl) - target[i];
+                    const struct cosines *c = &b->pair[i];
+                    const double share = scale * (.04 + .96 * fifth_power_below(c->nv));
+                    const double d = shown(ground / M_PI + share * ggx(c, a, a), c->nl) - target[i];
                     error += d * d;
                 }
                 if (error < best)
@@ -428,6 +441,8 @@ int gltf_brdf_new(struct gltf_brdf **out)
     make_pairs(*out);
     tabulate_sheen(*out);
     fit_sheen(*out);
+    for (int i = 0; i < GLTF_N_PAIRS; i++)
+        find_sheen(&(*out)->pair_sheen[i], *out, &(*out)->pair[i], (*out)->sheen_roughness);
     fit_coats(*out);
     return 0;
 }

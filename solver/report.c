@@ -562,11 +562,15 @@ static void put_materials(FILE *f, const struct report_source *s)
         fputs("<p>The object was solved as diffuse (Lambert): the albedo is all there is.</p>\n", f);
         return;
     }
-    if (n > 0)
+    if (n > 0) {
         fprintf(f, "<p>%d region%s of like material. <i>free</i>: varies from texel to texel; <i>tied</i>: one number for the region; <i>frozen</i>: the "
                    "pictures say nothing about it, it keeps the shared value.%s</p>\n", n, n == 1 ? "" : "s", n > n_columns ? " The first ones:" : "");
-    else
+    } else if (json_get(r, "theta")) {
         fputs("<p>One material for the whole object.</p>\n", f);
+    } else {
+        fputs("<p>The report names no regions: the maps above say what varies.</p>\n", f);
+        return;
+    }
     fputs("<div class=\"scroll\"><table><tr><th></th>", f);
     if (n <= 0)
         fputs("<td>everywhere</td>", f);

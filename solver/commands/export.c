@@ -91,7 +91,7 @@ static const struct argp argp = {
     "Write a solved material in the files of other programs.\v"
     "glb: model.glb, glTF 2.0 (metallic-roughness, KHR_materials_specular, _clearcoat, _sheen, _anisotropy). mtlx: model.mtlx, MaterialX "
     "1.38 disney_principled over EXR layers. obj: model.obj, model.mtl with PBR keys. blender: what config/blender/import_studiorig.py "
-    "reads (blender --python import_studiorig.py -- DIR). glTF's reflectance is not Disney's: every texel is fitted to it anew, and the "
+    "reads. glTF's reflectance is not Disney's: every texel is fitted to it anew, and the "
     "RMSE of that is printed and kept in export.json.",
     0,
     0,

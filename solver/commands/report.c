@@ -12,6 +12,7 @@
 
 #include <argp.h>
 #include <errno.h>
+#include <stdbool.h>
 #include <stdio.h>
 #include <stdlib.h>
 #include <string.h>
@@ -207,7 +208,11 @@ static int show_view(struct page *p, const struct renderer *renderer, const stru
 
 static int show_views(struct page *p, const struct report_inputs *in)
 {
+    bool nearest;
+    if (!p->solved.report || json_get_bool(p->solved.report, "render.nearest", &nearest))
+        nearest = false;
     const struct render_material material = {
+        .nearest = nearest,
         .model = p->solved.parameters.data ? REFLECT_DISNEY : REFLECT_LAMBERT,
         .variant = p->solved.variant,
         .albedo = &p->solved.albedo,
