@@ -303,8 +303,7 @@ void gltf_from_disney(const struct gltf_brdf *b, struct gltf_material *out, cons
     fit_lobes(b, out, m, tint);
     for (int k = 0; k < 3; k++)
         f0[k] = (1 - out->metallic) * .04 * out->specular_color[k] + out->metallic * out->base_color[k];
-    for (int round = 0; round < 2; round++) // S decides what the diffuse lobe keeps, the base colour decides S
-        fit_base_color(b, out, f0, (const double(*)[3])target);
+    fit_base_color(b, out, f0, (const double(*)[3])target); // once: S, which it changes, hardly moves the diffuse lobe
     if (!error)
         return;
     gltf_from_disney_by_name(&plain, m);

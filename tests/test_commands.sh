@@ -157,6 +157,17 @@ gives 0 "light turned all the way round" "$rigsolve" render "$dir/one/truth" --c
 "$rigsolve" compare "$dir/round/cam003.exr" "$dir/views/cam003.exr" --json >"$dir/compare.json" 2>"$dir/log"
 json_has "$dir/compare.json" '$d->{rmse_percent} < .01'
 result $? "is where it was"
+# The same object photographed under other light: by its lights, and by its panorama with the panels that say how far it is
+other="--cameras $dir/one/relit/cameras --samples 1"
+gives 0 "render under other lights" "$rigsolve" render "$dir/one/truth" $other --lights "$dir/one/relit/lights.json" -o "$dir/moved"
+"$rigsolve" compare "$dir/moved" "$dir/one/relit/linear" --json >"$dir/compare.json" 2>"$dir/log"
+json_has "$dir/compare.json" '$d->{rmse_percent} < .1 || do { print "RMSE $d->{rmse_percent} %\n"; 0 }'
+result $? "gives what was photographed there, to the rounding of half floats"
+gives 0 "render under another panorama" "$rigsolve" render "$dir/one/truth" $other --panorama "$dir/one/relit/panorama.exr" \
+    --world-from-probe "$dir/one/relit/probe.json" --panels "$dir/one/relit/panels.json" -n 256 -o "$dir/sky"
+"$rigsolve" compare "$dir/sky" "$dir/one/relit/linear" --json >"$dir/compare.json" 2>"$dir/log"
+json_has "$dir/compare.json" '$d->{rmse_percent} < .5 || do { print "RMSE $d->{rmse_percent} %\n"; 0 }'
+result $? "gives it too, but for the cut into 256 lights"
 gives 2 "render without cameras or turntable is a usage error" "$rigsolve" render "$dir/one/truth" -o "$dir/refused"
 gives 0 "report with the take's photographs" "$rigsolve" report "$dir/solve" --take "$dir/diffuse"
 [ "$(grep -c 'the photograph' "$dir/solve/report.html")" = 4 ] && ! grep -qE '<script|http' "$dir/solve/report.html"

@@ -59,7 +59,7 @@ static int read_mesh(struct solved *s, const char *command, const char *dir, con
         name = path;
     }
     const int err = mesh_read(&s->mesh, &check, name);
-    if (!err)
+    if (!err && mesh_path) // of its own mesh, solve has told already
         mesh_check_log(&check, &s->mesh, name);
     free(path);
     return err;
