@@ -148,7 +148,20 @@ static double find_exposure(const struct report_source *s)
     return bright > 0 ? .85 / bright : 1;
 }
 
-static int put_view(FILE *f, const struct report_view *v, double exposure)
+static bool was_set_aside(const struct json *report, const char *view)
+{
+    const int n = report ? json_length(report, "views_held_out") : 0;
+    for (int i = 0; i < n; i++) {
+        char key[48];
+        const char *name;
+        snprintf(key, sizeof(key), "views_held_out.%d", i);
+        if (!json_get_string(report, key, &name) && !strcmp(name, view))
+            return true;
+    }
+    return false;
+}
+
+static int put_view(FILE *f, const struct report_view *v, bool set_aside, double exposure)
 {
     const int width = v->input.width, height = v->input.height;
     const size_t n = (size_t)width * (size_t)height;
@@ -173,7 +186,7 @@ static int put_view(FILE *f, const struct report_view *v, double exposure)
     }
     fputs("<h3>", f);
     put_escaped(f, v->name);
-    fputs("</h3><div class=\"row\">\n", f);
+    fprintf(f, "%s</h3><div class=\"row\">\n", set_aside ? " <small>(set aside: not used for solving)</small>" : "");
     int err = put_figure(f, "third", width, height, 3, bytes, "the photograph", "the photograph");
     if (!err)
         err = put_figure(f, "third", width, height, 3, bytes + 3 * n, "the re-render", "what was solved, rendered");
@@ -199,7 +212,7 @@ static int put_views(FILE *f, const struct report_source *s)
     fprintf(f, "<p>%d of the views, all shown %.2g times as bright as measured. Small pictures; the RMSE is of these.</p>\n", s->n_views,
             exposure);
     for (int i = 0; !err && i < s->n_views; i++)
-        err = put_view(f, &s->view[i], exposure);
+        err = put_view(f, &s->view[i], was_set_aside(s->report, s->view[i].name), exposure);
     return err;
 }
 

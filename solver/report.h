@@ -17,7 +17,7 @@ struct report_view {
 
 struct report_source {
     const char *title;
-    const struct json *report;   // report.json
+    const struct json *report;   // report.json; its views_held_out[] names the views that were set aside
     const struct json *exported; // export.json
     const struct mesh *mesh;
     const struct image *albedo, *parameters, *std, *validity;

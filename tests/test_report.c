@@ -165,6 +165,23 @@ static void the_difference_is_shown_where_the_object_is(void **unused)
     image_free(&photograph), image_free(&difference), image_free(&view.input), image_free(&view.render);
 }
 
+static void a_view_that_was_set_aside_is_named_so(void **unused)
+{
+    (void)unused;
+    struct json *report = parse("{\"views_held_out\": [\"cam1\"]}");
+    struct report_view view[2] = { { .name = "cam0" }, { .name = "cam1" } };
+    for (int i = 0; i < 2; i++)
+        fill(&view[i].input, 4, 3, 3, .5f), fill(&view[i].render, 4, 3, 4, 1);
+    const struct report_source source = { .title = "t", .report = report, .view = view, .n_views = 2 };
+    char *page = page_of(&source);
+    assert_non_null(strstr(page, "<h3>cam0</h3>"));
+    assert_non_null(strstr(page, "<h3>cam1 <small>(set aside"));
+    free(page);
+    for (int i = 0; i < 2; i++)
+        image_free(&view[i].input), image_free(&view[i].render);
+    json_free(report);
+}
+
 static void every_region_says_which_parameters_are_free(void **unused)
 {
     (void)unused;
@@ -238,6 +255,7 @@ int main(void)
     const struct CMUnitTest tests[] = {
         cmocka_unit_test(the_page_needs_nothing_but_itself_and_escapes_what_it_is_told),
         cmocka_unit_test(the_difference_is_shown_where_the_object_is),
+        cmocka_unit_test(a_view_that_was_set_aside_is_named_so),
         cmocka_unit_test(every_region_says_which_parameters_are_free),
         cmocka_unit_test(a_page_with_nothing_to_say_is_still_a_page),
         cmocka_unit_test(shrinking_keeps_the_mean_whatever_the_factor),
