@@ -7,6 +7,7 @@
 #include "solver/cameras.h"
 #include "solver/rays.h"
 #include "solver/texels.h"
+#include <stdbool.h>
 #include <stdint.h>
 
 enum sample_flags {
@@ -31,6 +32,8 @@ struct samples_settings {
     double grazing_cos; // samples below are left out; .15 (SOLVER.md 2)
     int erode_px;       // samples this near (in pixels) to a silhouette or depth edge are left out; 1. Counted from the pixels a
                         // sample reads: 1 makes sure that no pixel that is read lies on the edge itself; 0 looks at their centres only
+    bool at_centre;     // take off what slope and curvature of the picture add to the mean over a footprint, as from a pixel around it
+                        // (which erode_px >= 1 makes sure is the same surface): the radiance at the texel's centre, to second order; true
     double white;       // clip level where an image has no "clip" channel; 1.0; 0: never
     int n_threads;
 };

@@ -7,6 +7,7 @@
 #include "solver/take/json.h"
 #include "solver/take/log.h"
 #include "solver/texels.h"
+#include "solver/xml.h"
 #include "tests/scratch.h"
 
 #include <errno.h>
@@ -433,23 +434,59 @@ static void layers_leave_as_they_are(void **unused)
         assert_true(layer.data[i] == studio.parameters.data[DISNEY_N * i + DISNEY_ROUGHNESS]);
     assert_memory_equal(albedo.data, studio.albedo.data, 3 * SIZE * SIZE * sizeof(float));
     assert_int_equal(access(scratch_path("layers/maps/metallic.exr"), F_OK), -1); // constant
-    char *text = text_of("layers/model.mtlx");
-    assert_non_null(strstr(text, "<materialx version=\"1.38\""));
-    assert_non_null(strstr(text, "<disney_principled name="));
-    assert_non_null(strstr(text, "value=\"maps/roughness.exr\""));
-    assert_non_null(strstr(text, "<input name=\"baseColor\" type=\"color3\" nodename=\"baseColor_map\" />"));
-    assert_non_null(strstr(text, "<input name=\"roughness\" type=\"float\" nodename=\"roughness_map\" />"));
-    assert_non_null(strstr(text, "<input name=\"clearcoatGloss\" type=\"float\" value=\"0.75\" />"));
-    for (int p = 0; p < DISNEY_N; p++) { // every input once
-        char input[64];
-        snprintf(input, sizeof(input), "<input name=\"%s\" ", disney_parameter_names[p]);
-        const char *first = strstr(text, input);
-        assert_non_null(first);
-        assert_null(strstr(first + 1, input));
-    }
-    free(text);
     image_free(&layer), image_free(&albedo);
     remove_folder("layers");
+}
+
+static const struct xml_element *child_named(const struct xml_element *e, const char *element, const char *name)
+{
+    const struct xml_element *c = xml_child(e, element);
+    while (c && strcmp(xml_attribute(c, "name"), name))
+        c = xml_next(c, element);
+    return c;
+}
+
+// Every input of disney_principled once, by its own name: a value where the map is constant, else an image whose file is there.
+static void materialx_takes_the_layers_one_to_one(void **unused)
+{
+    (void)unused;
+    const struct export_source source = source_of();
+    struct xml_element *root;
+    int n_inputs = 0;
+    export_to("mtlx", &source, EXPORT_MTLX);
+    char *text = text_of("mtlx/model.mtlx");
+    assert_int_equal(xml_parse(&root, text, strlen(text), "model.mtlx"), 0);
+    free(text);
+    assert_string_equal(root->name, "materialx");
+    assert_string_equal(xml_attribute(root, "version"), "1.38");
+    const struct xml_element *shader = xml_child(root, "disney_principled");
+    assert_non_null(shader);
+    assert_string_equal(xml_attribute(shader, "type"), "surfaceshader");
+    for (const struct xml_element *e = xml_child(shader, "input"); e; e = xml_next(e, "input"), n_inputs++) {
+        const char *name = xml_attribute(e, "name"), *node = xml_attribute(e, "nodename"), *value = xml_attribute(e, "value");
+        const bool colour = !strcmp(name, "baseColor"), varied = colour || !strcmp(name, "roughness");
+        char path[128];
+        assert_string_equal(xml_attribute(e, "type"), colour ? "color3" : "float");
+        if (!varied) {
+            int p = 0;
+            while (strcmp(disney_parameter_names[p], name))
+                assert_in_range(++p, 0, DISNEY_N - 1);
+            assert_null(node);
+            assert_true(strtof(value, NULL) == studio.parameters.data[p]);
+            continue;
+        }
+        assert_null(value);
+        const struct xml_element *image = child_named(root, "image", node);
+        assert_non_null(image);
+        assert_string_equal(xml_attribute(image, "type"), xml_attribute(e, "type"));
+        snprintf(path, sizeof(path), "mtlx/%s", xml_attribute(child_named(image, "input", "file"), "value"));
+        assert_int_equal(access(scratch_path(path), F_OK), 0);
+    }
+    assert_int_equal(n_inputs, 1 + DISNEY_N);
+    const struct xml_element *material = xml_child(root, "surfacematerial");
+    assert_string_equal(xml_attribute(child_named(material, "input", "surfaceshader"), "nodename"), xml_attribute(shader, "name"));
+    xml_free(root);
+    remove_folder("mtlx");
 }
 
 static void in_the_solves_own_folder_its_files_stay(void **unused)
@@ -584,6 +621,7 @@ int main(void)
         cmocka_unit_test(a_strong_specular_colour_is_scaled_by_its_factor),
         cmocka_unit_test(a_lambertian_solve_has_no_specular_lobe),
         cmocka_unit_test(layers_leave_as_they_are),
+        cmocka_unit_test(materialx_takes_the_layers_one_to_one),
         cmocka_unit_test(in_the_solves_own_folder_its_files_stay),
         cmocka_unit_test(an_obj_comes_back_and_its_material_names_files_that_are_there),
         cmocka_unit_test(the_report_lists_every_file_and_what_was_lost),

@@ -202,6 +202,7 @@ static int choose_held_out(struct scene *scene, const struct settings *s)
 static int load(struct scene *scene, struct settings *s)
 {
     struct samples_settings gather = samples_defaults();
+    struct lights cut = { 0 };
     gather.n_threads = s->n_threads;
     s->in.needs = TAKE_MESH | TAKE_CAMERAS | TAKE_PANORAMA | TAKE_VIEWS;
     s->in.texture = s->texture;
@@ -209,9 +210,10 @@ static int load(struct scene *scene, struct settings *s)
     if (!err)
         err = choose_held_out(scene, s);
     if (!err)
-        err = inputs_lights(&scene->lights, &s->in, NULL, s->n_lights * s->n_sub);
-    for (int i = 0; !err && i < scene->lights.n; i++)
-        scene->lights.group[i] = i / s->n_sub; // aligned runs are the regions of the coarser cut
+        err = inputs_lights(&cut, &s->in, NULL, s->n_lights);
+    if (!err)
+        err = lights_refine(&scene->lights, &cut, &s->in.panorama, s->n_lights * s->n_sub);
+    lights_free(&cut);
     if (err)
         return err;
     return samples_gather(&scene->samples, &s->in.texels, s->in.rays, &s->in.cameras, (const char *const *)s->in.picture,
