@@ -148,7 +148,7 @@ static double find_exposure(const struct report_source *s)
     return bright > 0 ? .85 / bright : 1;
 }
 
-static bool was_set_aside(const struct json *report, const char *view)
+bool report_set_aside(const struct json *report, const char *view)
 {
     const int n = report ? json_length(report, "views_held_out") : 0;
     for (int i = 0; i < n; i++) {
@@ -212,7 +212,7 @@ static int put_views(FILE *f, const struct report_source *s)
     fprintf(f, "<p>%d of the views, all shown %.2g times as bright as measured. Small pictures; the RMSE is of these.</p>\n", s->n_views,
             exposure);
     for (int i = 0; !err && i < s->n_views; i++)
-        err = put_view(f, &s->view[i], was_set_aside(s->report, s->view[i].name), exposure);
+        err = put_view(f, &s->view[i], report_set_aside(s->report, s->view[i].name), exposure);
     return err;
 }
 

@@ -7,6 +7,7 @@
 #include "solver/mesh.h"
 #include "solver/take/image.h"
 #include "solver/take/json.h"
+#include <stdbool.h>
 
 enum { REPORT_PICTURE_PX = 480 }; // pictures are shown at most this wide
 
@@ -29,6 +30,8 @@ struct report_source {
 
 // Atomic. 0, -errno (logged), -ENOMEM.
 int report_write(const struct report_source *source, const char *path);
+
+bool report_set_aside(const struct json *report, const char *view); // report NULL: false
 
 // Area mean of an image at another size, no larger. 0 or -ENOMEM.
 int report_shrink(struct image *out, const struct image *image, int width, int height);

@@ -206,6 +206,19 @@ static int show_view(struct page *p, const struct renderer *renderer, const stru
     return err;
 }
 
+// n of the n_with cameras, spread over their order; the last is one that was set aside, if there is any and it is not among them.
+static void choose_views(const struct page *p, const int *with, int n_with, int *out, int n)
+{
+    bool has_aside = false;
+    for (int i = 0; i < n; i++) {
+        out[i] = with[(int)((int64_t)(2 * i + 1) * n_with / (2 * n))];
+        has_aside = has_aside || report_set_aside(p->solved.report, p->cameras.view[out[i]].name);
+    }
+    for (int i = n_with - 1; n && i >= 0 && !has_aside; i--)
+        if (report_set_aside(p->solved.report, p->cameras.view[with[i]].name))
+            out[n - 1] = with[i], has_aside = true;
+}
+
 static int show_views(struct page *p, const struct report_inputs *in)
 {
     bool nearest;
@@ -241,10 +254,10 @@ static int show_views(struct page *p, const struct report_inputs *in)
     if (!err && n)
         err = renderer_new(&renderer, &p->solved.mesh, rays, &p->solved.lights, &material, &settings);
     progress_begin("report", n);
-    for (int i = 0; !err && i < n; i++, progress_add(1)) {
-        const int view = with[(int)((int64_t)(2 * i + 1) * n_with / (2 * n))]; // spread over the views' order
-        err = show_view(p, renderer, &p->cameras.view[view], photograph[view]);
-    }
+    int chosen[MAX_VIEWS];
+    choose_views(p, with, err ? 0 : n_with, chosen, err ? 0 : n);
+    for (int i = 0; !err && i < n; i++, progress_add(1))
+        err = show_view(p, renderer, &p->cameras.view[chosen[i]], photograph[chosen[i]]);
     progress_end();
     renderer_free(renderer);
     rays_free(rays);
