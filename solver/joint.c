@@ -16,7 +16,7 @@ struct joint_settings joint_defaults(enum method method)
 {
     return (struct joint_settings){ .method = method, .w_sim = method == METHOD_ALTERNATING ? 1e-3 : -1,
                                     .start_distance_m = method == METHOD_ALTERNATING ? 2 : 0, .visibility = method == METHOD_JOINT,
-                                    .robust = false };
+                                    .planes = method == METHOD_JOINT, .robust = false };
 }
 
 const char *joint_doubt_text(unsigned one_bit)
@@ -116,7 +116,28 @@ static int sweep(const struct photometric *p, const struct lights *lights, const
 
 // Half floats and bilinear look-ups leave about this much (percent of white) in any comparison; to gain less is to gain nothing.
 static const double floor_percent = .03;
-static const double plane_weight = 1e-2;
+// A plane's lights are held on it this much harder than neighbours on one sphere, of which each has 8 at 1 / |dh_i - dh_j|^2 ~ 50.
+static const double plane_share = 400, first_plane_w_sim = 1e-5, plane_tolerance = .06;
+
+// Lights that lie on one plane by now are held on it.
+static int find_planes(struct stage1 *s, double tolerance, double w_plane)
+{
+    struct emitters planes;
+    const int first = s->layout.inverse_distance, n_groups = s->p.n_groups;
+    double q[n_groups];
+    int n_on = 0;
+    photometric_pack(&s->p, &s->base, s->x);
+    for (int g = 0; g < n_groups; g++)
+        q[g] = s->is_free[first + g] ? s->x[first + g] : 0;
+    const int err = emitters_find(&planes, n_groups, (const double(*)[3])s->group_dir, q, tolerance);
+    if (err)
+        return err;
+    for (int g = 0; g < n_groups; g++)
+        n_on += planes.of[g] >= 0;
+    log_debug("joint: %d of %d lights on %d planes", n_on, n_groups, planes.n);
+    stage1_set_planes(s, &planes, w_plane);
+    return 0;
+}
 
 // Continuation: w_sim falls by decades, and after each step the views set aside are measured. Kept is the *largest* weight whose
 // error is within 3 % of the best, or within the pictures' own rounding: below that, lights that the pictures hardly see drift off
@@ -132,6 +153,10 @@ static int continuation(struct stage1 *s, const uint8_t *aside)
     for (double w = first_w_sim; !err && n < MAX_STEPS; w = w > 1e-13 ? w / 10 : 0) {
         struct photometric_error e;
         s->w_sim = weight[n] = w > last ? w : last;
+        if (s->set->planes && w <= first_plane_w_sim)
+            err = find_planes(s, plane_tolerance, plane_share * s->w_sim);
+        if (err)
+            break;
         s->p.texel_step = stage1_step_for(s, COARSE_SAMPLES);
         err = stage1_trace_visibility(s);
         if (!err)
@@ -161,53 +186,13 @@ static int continuation(struct stage1 *s, const uint8_t *aside)
             chosen = n - 1;
         photometric_state_copy(&s->p, &s->base, &at[chosen]);
         s->w_sim = weight[chosen];
+        log_debug("joint: w_sim %.0e it is", s->w_sim);
+        if (s->set->planes)
+            err = find_planes(s, plane_tolerance, plane_share * s->w_sim);
     }
     progress_end();
     for (int i = 0; i < MAX_STEPS; i++)
         photometric_state_free(&at[i]);
-    return err;
-}
-
-// The simplest light that the views set aside accept: lights that lie nearly on one plane are put on it. Three rounds, for lights
-// that stand better join the next.
-static int put_on_planes(struct stage1 *s, const uint8_t *aside)
-{
-    static const double tolerance[] = { .08, .05, .04 };
-    const int first = s->layout.inverse_distance, n_groups = s->p.n_groups;
-    struct photometric_state before = { 0 };
-    struct photometric_error e;
-    double best, q[n_groups];
-    int err = photometric_state_new(&before, &s->p, &s->base.lights);
-    if (!err)
-        err = stage1_measure(s, &s->base, aside, &e);
-    best = photometric_rmse_percent(&e);
-    for (int k = 0; !err && k < 3; k++) {
-        struct emitters planes;
-        photometric_pack(&s->p, &s->base, s->x);
-        for (int g = 0; g < n_groups; g++)
-            q[g] = s->is_free[first + g] ? s->x[first + g] : 0;
-        photometric_state_copy(&s->p, &before, &s->base);
-        err = emitters_find(&planes, n_groups, (const double(*)[3])s->group_dir, q, tolerance[k]);
-        if (err)
-            break;
-        int n_on = 0, n_planes = planes.n;
-        for (int g = 0; g < n_groups; g++)
-            n_on += planes.of[g] >= 0;
-        stage1_set_planes(s, &planes, plane_weight);
-        s->p.texel_step = stage1_step_for(s, COARSE_SAMPLES);
-        err = stage1_trace_visibility(s);
-        if (!err)
-            err = stage1_minimise(s, 8, 2e-3, NULL);
-        s->p.texel_step = stage1_step_for(s, FINE_SAMPLES);
-        if (!err)
-            err = photometric_evaluate(&s->p, &s->base, s->p.albedo == ALBEDO_FREE, &e);
-        if (!err)
-            err = stage1_measure(s, &s->base, aside, &e);
-        const double error = photometric_rmse_percent(&e);
-        log_debug("joint: %d lights on %d planes: views set aside %.4f %%, before %.4f %%", n_on, n_planes, error, best);
-        best = fmin(best, error);
-    }
-    photometric_state_free(&before);
     return err;
 }
 
@@ -286,15 +271,13 @@ static int solve_joint(struct stage1 *s, const struct photometric *p, const stru
     photometric_unpack(&c.p, &c.base, s->x);
     c.p.use_view = seen >= 8 ? inner : fit;
     err = continuation(&c, seen >= 8 ? aside : fit);
-    if (!err)
-        err = put_on_planes(&c, seen >= 8 ? aside : fit);
     if (err)
         goto end;
     photometric_pack(&c.p, &c.base, s->x);
     memcpy(s->base.lights.world_from_probe, c.base.lights.world_from_probe, sizeof(start.lights.world_from_probe));
     photometric_unpack(&s->p, &s->base, s->x);
     if (c.emitters.n)
-        stage1_set_planes(s, &c.emitters, plane_weight);
+        stage1_set_planes(s, &c.emitters, c.w_plane);
     memcpy(s->base.albedo, c.base.albedo, (size_t)p->texels->n * sizeof(*c.base.albedo));
     s->w_sim = c.w_sim;
     s->n_jacobians += c.n_jacobians, s->n_evaluations += c.n_evaluations;

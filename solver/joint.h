@@ -22,6 +22,7 @@ struct joint_settings {
     double w_sim;            // alternating: weight of Eq. 11 beside the *sum* of squared residuals (paper). joint: the last weight of the
                              // continuation, beside the *mean*; negative: stopped by the views set aside (default)
     bool visibility;         // trace shadows, and again when lights have moved
+    bool planes;             // joint: lights that lie on one plane, if the views set aside accept it, stay on it
     bool robust;             // down-weight outliers in the last stage
     bool gain;               // one unknown exposure factor per camera (prior 2 %)
     int n_threads;

@@ -68,10 +68,11 @@ static double half_side(double spread_px)
 
 // A texel is a square of texel_size_m on the surface, a parallelogram in the picture; the box has
 // its spread along x and y. A box of one pixel is bilinear interpolation. False: the box, or those
-// that the gradient compares, leave the picture.
+// that are compared with it, leave the picture.
 static bool footprint_of(struct footprint *f, const struct texels *t, int64_t i,
-                         const struct camera *camera)
+                         const struct camera *camera, bool at_centre)
 {
+    const double margin_px = at_centre ? 1 : GRADIENT_STEP_PX;
     double point[3], tangent[3], bitangent[3], normal[3], uv_px[2], J[6], M[4];
     for (int c = 0; c < 3; c++) {
         point[c] = (double)t->position_m[i][c];
@@ -87,7 +88,7 @@ static bool footprint_of(struct footprint *f, const struct texels *t, int64_t i,
     f->u_px = uv_px[0], f->v_px = uv_px[1];
     f->half_width_px = half_side(length_of(M[0], M[1]));
     f->half_height_px = half_side(length_of(M[2], M[3]));
-    const double x_reach = f->half_width_px + 1, y_reach = f->half_height_px + 1;
+    const double x_reach = f->half_width_px + margin_px, y_reach = f->half_height_px + margin_px;
     if (!(f->u_px >= x_reach && f->u_px <= camera->width_px - x_reach && f->v_px >= y_reach &&
           f->v_px <= camera->height_px - y_reach))
         return false;
@@ -139,7 +140,7 @@ static void want_pixels(void *arg, int64_t begin, int64_t end, int worker)
         struct footprint f;
         if (job->mask[i] != MASK_VISIBLE)
             continue;
-        if (!footprint_of(&f, job->texels, i, job->camera)) {
+        if (!footprint_of(&f, job->texels, i, job->camera, job->settings->at_centre)) {
             job->mask[i] = MASK_OUTSIDE;
             continue;
         }
@@ -293,7 +294,7 @@ static void read_texels(void *arg, int64_t begin, int64_t end, int worker)
         struct footprint f;
         if (job->mask[i] != MASK_VISIBLE)
             continue;
-        if (!footprint_of(&f, job->texels, i, job->camera) || !sees_only_its_surface(job, i, &f)) {
+        if (!footprint_of(&f, job->texels, i, job->camera, job->settings->at_centre) || !sees_only_its_surface(job, i, &f)) {
             job->mask[i] = MASK_OCCLUDED;
             continue;
         }

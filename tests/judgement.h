@@ -262,7 +262,7 @@ static inline int judge_lights(struct judgement *out, const struct judge_truth *
     for (int i = 0, end; i < l->n; i = end) {
         struct judge_seen seen = {0};
         double weight = 0, q = 0, dir[3] = {0}, here[3], there[3], off[3];
-        for (end = i + 1; n_sub > 1 && end < l->n && l->group[end] == l->group[i];)
+        for (end = i + 1; n_sub > 1 && end < l->n && l->group[i] >= 0 && l->group[end] == l->group[i];)
             end++;
         for (int k = i; k < end; k++) {
             const double luminance = judge_light_luminance(l, k);
