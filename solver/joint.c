@@ -2,6 +2,7 @@
 #include "solver/stage1.h"
 
 #include "solver/lm.h"
+#include "solver/misfit.h"
 #include "solver/take/log.h"
 #include "solver/take/progress.h"
 #include "solver/vec3.h"
@@ -117,7 +118,7 @@ static int sweep(const struct photometric *p, const struct lights *lights, const
 // Half floats and bilinear look-ups leave about this much (percent of white) in any comparison; to gain less is to gain nothing.
 static const double floor_percent = .03;
 // A plane's lights are held on it this much harder than neighbours on one sphere, of which each has 8 at 1 / |dh_i - dh_j|^2 ~ 50.
-static const double plane_share = 400, first_plane_w_sim = 1e-5, plane_tolerance = .06;
+static const double plane_share = 400, plane_tolerance = .06;
 
 // Lights that lie on one plane by now are held on it.
 static int find_planes(struct stage1 *s, double tolerance, double w_plane)
@@ -137,6 +138,21 @@ static int find_planes(struct stage1 *s, double tolerance, double w_plane)
     log_debug("joint: %d of %d lights on %d planes", n_on, n_groups, planes.n);
     stage1_set_planes(s, &planes, w_plane);
     return 0;
+}
+
+// The weight at which E_sim says what is known of rooms before any picture - a wall seen at 45 degrees costs 1 per neighbour, and there
+// are 8 - beside residuals whose structure, which neighbours share, is no independent evidence (misfit.h).
+static int weigh_similarity(const struct stage1 *s, double *w_sim)
+{
+    double deviation[s->layout.n], inflation;
+    struct photometric_error e;
+    int err = misfit_deviations(deviation, &inflation, &s->p, &s->base, s->is_free, NULL);
+    if (!err)
+        err = photometric_evaluate(&s->p, (struct photometric_state *)&s->base, false, &e);
+    const double n = fmax(3 * (double)e.n, 1), sigma2 = 2 * e.cost / n;
+    *w_sim = inflation * sigma2 / (8 * n);
+    log_debug("joint: %.0f residuals of %.4f %%, each %.0f times seen: w_sim %.2e", n, 100 * sqrt(sigma2), inflation, *w_sim);
+    return err;
 }
 
 // Continuation: w_sim falls by decades, and after each step the views set aside are measured. Kept is the *largest* weight whose
@@ -170,6 +186,8 @@ static int continuation(struct stage1 *s, const uint8_t *aside)
         photometric_state_copy(&s->p, &at[n], &s->base);
         error[n] = photometric_rmse_percent(&e);
         log_debug("joint: w_sim %.0e: views set aside %.4f %%", w, error[n]);
+        double w2;
+        weigh_similarity(s, &w2);
         n_worse = error[n] < .97 * best ? 0 : n_worse + 1;
         best = fmin(best, error[n++]);
         if (w <= last || (s->set->w_sim < 0 && w < 1e-8 && n_worse >= 3))
@@ -183,6 +201,8 @@ static int continuation(struct stage1 *s, const uint8_t *aside)
         photometric_state_copy(&s->p, &s->base, &at[chosen]);
         s->w_sim = weight[chosen];
         log_debug("joint: w_sim %.0e it is", s->w_sim);
+        double w;
+        weigh_similarity(s, &w);
         for (int k = 0; !err && s->set->planes && k < 2; k++) {
             struct photometric_error e;
             err = find_planes(s, plane_tolerance, plane_share * s->w_sim);
