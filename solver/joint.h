@@ -6,6 +6,7 @@
 //   METHOD_JOINT        ours: albedo eliminated, 1/r, a coarse sweep for the start, continuation in w_sim stopped by views set aside
 //                       (SOLVER.md 4)
 #pragma once
+#include "solver/misfit.h"
 #include "solver/photometric.h"
 #include "solver/rays.h"
 
@@ -33,8 +34,8 @@ enum joint_doubt { // why an answer is not to be trusted; bits
     DOUBT_NO_INFORMATION = 1, // diffuse with free albedo: nothing says how far the lights are; solved as directional
     DOUBT_FEW_VIEWS = 2,      // fewer than 3 views see the object
     DOUBT_MIRRORED = 4,       // the mirrored panorama explains the pictures better
-    DOUBT_UNCERTAIN = 8,      // the standard deviation of the centre is above 10 cm, or the distances' median above 15 %
-    DOUBT_POOR_FIT = 16,      // the residual is far above the noise: a light is missing, or something moved
+    DOUBT_UNCERTAIN = 8,      // the standard deviation of the centre is above 10 cm, or the distances' mean above 15 %
+    DOUBT_POOR_FIT = 16,      // what is left of the pictures has structure (misfit.h): a light is missing, or something moved
 };
 const char *joint_doubt_text(unsigned one_bit);
 
@@ -46,10 +47,12 @@ struct joint_result {
     double w_sim;                    // the last one, our normalisation (mean); w_sim_sum: beside the sum
     double w_sim_sum;
     const char *stop_reason;
-    // Standard deviations from the final normal equations; infinite where nothing depends on an unknown. They know of
-    // noise, not of what the model lacks.
+    // Standard deviations (misfit_deviations); infinite where nothing depends on an unknown.
     double theta_std[DISNEY_N], centre_std_m[3], rotation_std_rad[3];
     double *inverse_distance_std;    // [groups] 1/m; owned
+    double distance_std_relative;    // mean over the lights
+    double inflation;                // of the distances' variances over independent samples
+    struct misfit misfit;            // what is left of the pictures
     double objective;                // mean squared residual of the fit
     unsigned doubts;                 // 0: trusted
 };

@@ -182,20 +182,22 @@ static int pull_of_patches(double *A, double *g, int *n, const struct photometri
 }
 
 // Median over the distances of (variance by patches) / (variance of independent samples); C = A^-1.
-static double inflation_of(const double *C, const double *g, int n_patches, double sigma2, const unsigned char *used,
-                           const struct photometric_layout *l)
+// How much larger each unknown's variance is than sigma2 C says, when a patch is one draw ([n], at least 1). Returns the median over the
+// distances: one of them alone is told by few patches.
+static double inflations(double *inflation, const double *C, const double *g, int n_patches, double sigma2, const unsigned char *used,
+                         const struct photometric_layout *l)
 {
     const size_t n = (size_t)l->n;
-    double ratio[l->n_groups], mean[n];
+    double of_distances[l->n_groups], mean[n];
     int m = 0;
     for (size_t j = 0; j < n; j++) {
         mean[j] = 0;
         for (int k = 0; k < n_patches; k++)
             mean[j] += g[(size_t)k * n + j] / n_patches;
     }
-    for (int group = 0; group < l->n_groups; group++) {
-        const size_t i = (size_t)(l->inverse_distance + group);
+    for (size_t i = 0; i < n; i++) {
         double sum = 0;
+        inflation[i] = 1;
         for (int k = 0; used[i] && k < n_patches; k++) {
             double step = 0;
             for (size_t j = 0; j < n; j++)
@@ -203,10 +205,12 @@ static double inflation_of(const double *C, const double *g, int n_patches, doub
             sum += step * step;
         }
         if (used[i])
-            ratio[m++] = sum * n_patches / (n_patches - 1) / (sigma2 * C[i * n + i]);
+            inflation[i] = fmax(sum * n_patches / (n_patches - 1) / (sigma2 * C[i * n + i]), 1);
+        if (used[i] && i >= (size_t)l->inverse_distance)
+            of_distances[m++] = inflation[i];
     }
-    qsort(ratio, (size_t)m, sizeof(double), by_double);
-    return m && ratio[m / 2] > 1 ? ratio[m / 2] : 1;
+    qsort(of_distances, (size_t)m, sizeof(double), by_double);
+    return m ? of_distances[m / 2] : 1;
 }
 
 int misfit_deviations(double *deviation, double *inflation, const struct photometric *p, const struct photometric_state *s,
@@ -216,6 +220,7 @@ int misfit_deviations(double *deviation, double *inflation, const struct photome
     const size_t n = (size_t)l.n;
     double *A = calloc(n * n, sizeof(double)), *C = calloc(n * n, sizeof(double)), *g = calloc(N_PATCHES * n, sizeof(double));
     unsigned char used[n];
+    double own[n];
     struct photometric_error e = { 0 };
     int n_patches = 0, singular = 0;
     int err = A && C && g ? pull_of_patches(A, g, &n_patches, p, s, is_free, n) : -ENOMEM;
@@ -229,9 +234,11 @@ int misfit_deviations(double *deviation, double *inflation, const struct photome
         A[i * n + i] *= 1 + 1e-12;
     }
     *inflation = 1;
+    for (size_t i = 0; i < n; i++)
+        own[i] = 1;
     singular = lm_inverse(l.n, A, used, C);
     if (!singular && n_patches > 1 && sigma2 > 0)
-        *inflation = inflation_of(C, g, n_patches, sigma2, used, &l);
+        *inflation = inflations(own, C, g, n_patches, sigma2, used, &l);
     if (singular != -ENOMEM && prior && sigma2 > 0) {
         for (size_t i = 0; i < n * n; i++)
             A[i] += *inflation * sigma2 * prior[i];
@@ -239,7 +246,8 @@ int misfit_deviations(double *deviation, double *inflation, const struct photome
     }
     err = singular == -ENOMEM ? -ENOMEM : 0;
     for (size_t i = 0; !err && i < n; i++)
-        deviation[i] = !used[i] ? INFINITY : singular ? NAN : sqrt(*inflation * sigma2 * C[i * (n + 1)]);
+        deviation[i] = !used[i] ? INFINITY : singular ? NAN
+                       : sqrt((i < (size_t)l.inverse_distance ? fmax(own[i], *inflation) : *inflation) * sigma2 * C[i * (n + 1)]);
 end:
     free(A), free(C), free(g);
     return err;

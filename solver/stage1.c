@@ -62,7 +62,7 @@ static int find_pairs(struct stage1 *s, const struct lights *l)
     return err;
 }
 
-static double similarity_on_planes = .1;
+static const double similarity_on_planes = .1;
 
 // u(x): log(1/r), or r itself in paper mode; and du/dx.
 static double similarity_of(const struct stage1 *s, double x, double *slope)
@@ -225,6 +225,23 @@ static int normal_callback(void *arg, const double *x, double *cost, double *A, 
     return 0;
 }
 
+void stage1_add_prior(const struct stage1 *s, double *P)
+{
+    const int n = s->layout.n;
+    struct stage1 known = *s;
+    double g[n];
+    memset(g, 0, sizeof(g));
+    if (s->set->method == METHOD_DIRECTIONAL)
+        return;
+    known.in_distance = false;
+    known.w_sim = 1. / N_NEIGHBOURS;
+    known.w_plane = s->w_sim > 0 ? s->w_plane / s->w_sim * known.w_sim : 0;
+    photometric_pack(&s->p, &s->base, s->x);
+    add_similarity(&known, s->x, P, g);
+    for (int v = 0; s->set->gain && v < s->layout.n_views; v++)
+        P[(size_t)(s->layout.gain + v) * n + s->layout.gain + v] += gain_precision();
+}
+
 int stage1_normal_equations(struct stage1 *s, double *cost, double *A, double *g)
 {
     const bool in_distance = s->in_distance;
@@ -324,12 +341,6 @@ void stage1_set_distances(struct stage1 *s, double distance_m)
 }
 
 // ---- a stage's life --------------------------------------------------------------------------------------------------------
-
-__attribute__((constructor)) static void tmp_env(void)
-{
-    if (getenv("SOP"))
-        similarity_on_planes = atof(getenv("SOP"));
-}
 
 int stage1_new(struct stage1 *s, const struct photometric *p, const struct lights *lights, const struct rays *rays,
                       const struct joint_settings *set)
