@@ -141,9 +141,34 @@ static int find_planes(struct stage1 *s, double tolerance, double w_plane)
     return 0;
 }
 
+// Lights that lie on one plane are held on it; twice, for lights that stand better may join. `before`, without planes, is what remains
+// where the views set aside do not like it.
+static int put_on_planes(struct stage1 *s, const uint8_t *aside, const struct photometric_state *before, double error_before)
+{
+    struct emitters none = { 0 };
+    struct photometric_error e;
+    int err = 0;
+    for (int k = 0; !err && k < 2; k++) {
+        err = find_planes(s, plane_tolerance, plane_share * s->w_sim);
+        s->p.texel_step = stage1_step_for(s, COARSE_SAMPLES);
+        if (!err)
+            err = stage1_minimise(s, 8, 2e-3, NULL);
+        s->p.texel_step = stage1_step_for(s, FINE_SAMPLES);
+        if (!err)
+            err = photometric_evaluate(&s->p, &s->base, s->p.albedo == ALBEDO_FREE, &e);
+        if (!err)
+            err = stage1_measure(s, &s->base, aside, &e);
+        log_debug("joint: views set aside %.4f %%, before %.4f %%", photometric_rmse_percent(&e), error_before);
+    }
+    if (err || photometric_rmse_percent(&e) <= error_before)
+        return err;
+    stage1_set_planes(s, &none, 0);
+    photometric_state_copy(&s->p, &s->base, before);
+    return 0;
+}
+
 // Continuation: w_sim falls by decades, and after each step the views set aside are measured. Kept is the *largest* weight whose
-// error is as good as the best: below that, lights that the pictures hardly see drift off for nothing. Then lights that lie on one plane
-// are held on it, twice, for lights that stand better may join.
+// error is as good as the best: below that, lights that the pictures hardly see drift off for nothing. Then planes.
 static int continuation(struct stage1 *s, const uint8_t *aside)
 {
     enum { MAX_STEPS = 13 };
@@ -193,19 +218,8 @@ static int continuation(struct stage1 *s, const uint8_t *aside)
         photometric_state_copy(&s->p, &s->base, &at[chosen]);
         s->w_sim = weight[chosen];
         log_debug("joint: w_sim %.0e it is", s->w_sim);
-        for (int k = 0; !err && s->set->planes && k < 2; k++) {
-            struct photometric_error e;
-            err = find_planes(s, plane_tolerance, plane_share * s->w_sim);
-            s->p.texel_step = stage1_step_for(s, COARSE_SAMPLES);
-            if (!err)
-                err = stage1_minimise(s, 8, 2e-3, NULL);
-            s->p.texel_step = stage1_step_for(s, FINE_SAMPLES);
-            if (!err)
-                err = photometric_evaluate(&s->p, &s->base, s->p.albedo == ALBEDO_FREE, &e);
-            if (!err)
-                err = stage1_measure(s, &s->base, aside, &e);
-            log_debug("joint: w_sim %.0e: views set aside %.4f %%", s->w_sim, photometric_rmse_percent(&e));
-        }
+        if (s->set->planes)
+            err = put_on_planes(s, aside, &at[chosen], error[chosen]);
     }
     progress_end();
     for (int i = 0; i < MAX_STEPS; i++)
@@ -230,7 +244,7 @@ static int refine(struct stage1 *s, const uint8_t *fit)
         s->p.weight = weight;
     }
     if (!err)
-        err = stage1_minimise(s, s->set->method == METHOD_JOINT ? 15 : 40, 1e-4, NULL);
+        err = stage1_minimise(s, 15, 1e-5, NULL);
     s->p.weight = NULL;
     s->p.texel_step = 1;
     if (!err)
