@@ -297,6 +297,57 @@ static void regions_partition_the_panorama_and_keep_its_energy(void **state)
     panorama_free(&p);
 }
 
+static void finer_lights_are_where_one_light_was_coarsest(void **state)
+{
+    (void)state;
+    enum { N = 64, FINE = 300 };
+    struct panorama p = room(96);
+    struct lights coarse, fine, again;
+    assert_int_equal(lights_median_cut(&coarse, &p, N), 0);
+    coarse.centre_m[1] = 2;
+    for (int i = 0; i < N; i++)
+        coarse.inverse_distance[i] = 1 / (1. + i);
+    assert_int_equal(lights_refine(&fine, &coarse, &p, FINE), 0);
+    assert_int_equal(fine.n, FINE);
+    assert_partition(&fine);
+    assert_same_energy(&fine, &p, 1e-12);
+    assert_true(fine.centre_m[1] == 2);
+    double sum[N][3] = {{0}}, worst = 0, least_split = INFINITY;
+    int parts[N] = {0};
+    for (int i = 0; i < FINE; i++) {
+        const int g = fine.group[i];
+        const struct light_region r = fine.region[i], whole = coarse.region[g];
+        assert_true(g >= (i ? fine.group[i - 1] : 0) && g < N);
+        assert_true(fine.inverse_distance[i] == coarse.inverse_distance[g]);
+        assert_true(r.x0 >= whole.x0 && r.x1 <= whole.x1 && r.y0 >= whole.y0 && r.y1 <= whole.y1);
+        for (int c = 0; c < 3; c++)
+            sum[g][c] += fine.irradiance[i][c];
+        parts[g]++;
+        if (r.x1 - r.x0 > 1 || r.y1 - r.y0 > 1)
+            worst = fmax(worst, (fine.irradiance[i][0] + fine.irradiance[i][1] +
+                                 fine.irradiance[i][2]) *
+                                    pow(fine.spread_rad[i], 2));
+    }
+    for (int g = 0; g < N; g++) {
+        assert_true(parts[g] > 0);
+        for (int c = 0; c < 3; c++)
+            assert_near(sum[g][c], coarse.irradiance[g][c], 1e-12 * (1 + coarse.irradiance[g][c]));
+        if (parts[g] > 1) // it was split for a reason: it was coarser than what remained whole
+            least_split =
+                fmin(least_split, (coarse.irradiance[g][0] + coarse.irradiance[g][1] +
+                                   coarse.irradiance[g][2]) *
+                                      pow(coarse.spread_rad[g], 2));
+    }
+    assert_true(worst > 0 && least_split >= worst);
+    assert_int_equal(lights_refine(&again, &coarse, &p, N), 0); // nothing to do
+    assert_memory_equal(again.dir_probe, coarse.dir_probe, N * sizeof(*coarse.dir_probe));
+    assert_memory_equal(again.irradiance, coarse.irradiance, N * sizeof(*coarse.irradiance));
+    lights_free(&again);
+    lights_free(&fine);
+    lights_free(&coarse);
+    panorama_free(&p);
+}
+
 static double energy_of(const struct panorama *p, int x0, int y0, int x1, int y1)
 {
     double sum = 0;
@@ -1318,6 +1369,7 @@ int main(void)
         cmocka_unit_test(far_lights_become_directional),
         cmocka_unit_test(behind_and_at_a_light_there_is_no_light),
         cmocka_unit_test(regions_partition_the_panorama_and_keep_its_energy),
+        cmocka_unit_test(finer_lights_are_where_one_light_was_coarsest),
         cmocka_unit_test(every_region_is_halved_along_its_longer_side_at_the_best_place),
         cmocka_unit_test(lone_bright_pixels_on_black_get_one_light_each),
         cmocka_unit_test(a_lone_bright_pixel_is_found_in_log2_steps),

@@ -630,6 +630,36 @@ static void equations_hold_for_runs_of_lights(void **state)
     }
 }
 
+// Groups of unequal sizes whose lights have distances of their own, in a fixed ratio to their group's.
+static void equations_hold_for_lights_in_ratio_to_their_group(void **state)
+{
+    (void)state;
+    for (int model = REFLECT_DISNEY; model <= REFLECT_LAMBERT; model++) {
+        struct studio s;
+        float ratio[N_LIGHTS];
+        studio_open(&s, (enum reflectance)model, ALBEDO_FREE);
+        s.p.ratio_of_light = ratio;
+        s.p.n_groups = 0;
+        for (int i = 0; i < N_LIGHTS; i++) {
+            s.group[i] = i == 0 ? 0 : s.group[i - 1] + (i % 5 == 1 || i % 3 == 0);
+            s.p.n_groups = s.group[i] + 1;
+            ratio[i] = (float)(.6 + .9 * uniform(4, (uint64_t)i));
+            s.truth.lights.inverse_distance[i] = (.4 + uniform(3, (uint64_t)s.group[i])) * (double)ratio[i];
+        }
+        photograph(&s, 0);
+        equations_hold(&s);
+        double x[layout_of(&s.p).n];
+        struct photometric_state back;
+        new_copy(&s, &back, &s.truth);
+        photometric_pack(&s.p, &s.truth, x);
+        photometric_unpack(&s.p, &back, x);
+        for (int i = 0; i < N_LIGHTS; i++)
+            close_to(back.lights.inverse_distance[i], s.truth.lights.inverse_distance[i], 1e-14);
+        photometric_state_free(&back);
+        studio_close(&s);
+    }
+}
+
 // Weights with zeros, views and texels left out. What is left out must not matter: it is filled with nonsense.
 struct choice {
     uint8_t use_view[N_VIEWS];
@@ -960,6 +990,7 @@ int main(void)
         cmocka_unit_test(measuring_leaves_the_albedo_alone),
         cmocka_unit_test(equations_are_those_of_the_residuals),
         cmocka_unit_test(equations_hold_for_runs_of_lights),
+        cmocka_unit_test(equations_hold_for_lights_in_ratio_to_their_group),
         cmocka_unit_test(what_is_left_out_does_not_count),
         cmocka_unit_test(clipped_samples_are_lower_bounds),
         cmocka_unit_test(clipped_samples_do_not_pull_the_albedo),
