@@ -17,7 +17,7 @@ struct joint_settings joint_defaults(enum method method)
 {
     return (struct joint_settings){ .method = method, .w_sim = method == METHOD_ALTERNATING ? 3e-9 : -1,
                                     .start_distance_m = method == METHOD_ALTERNATING ? 2 : 0, .visibility = method == METHOD_JOINT,
-                                    .planes = method == METHOD_JOINT, .robust = false };
+                                    .continuation = true, .planes = method == METHOD_JOINT, .robust = false };
 }
 
 const char *joint_doubt_text(unsigned one_bit)
@@ -109,6 +109,7 @@ static int sweep(const struct photometric *p, const struct lights *lights, const
             photometric_state_copy(&coarse, best, &s.base);
         }
         total->n_jacobians += s.n_jacobians, total->n_evaluations += s.n_evaluations;
+        total->n_sweep_jacobians += s.n_jacobians;
         stage1_free(&s);
     }
     free(one_group);
@@ -177,7 +178,7 @@ static int continuation(struct stage1 *s, const uint8_t *aside)
     double error[MAX_STEPS], weight[MAX_STEPS], best = INFINITY;
     int n = 0, n_worse = 0, chosen = 0, err = 0;
     progress_begin("joint", MAX_STEPS);
-    for (double w = first_w_sim; !err && n < MAX_STEPS; w = w > 1e-13 ? w / 10 : 0) {
+    for (double w = s->set->continuation ? first_w_sim : last; !err && n < MAX_STEPS; w = w > 1e-13 ? w / 10 : 0) {
         struct photometric_error e;
         s->w_sim = weight[n] = w > last ? w : last;
         s->p.texel_step = stage1_step_for(s, COARSE_SAMPLES);
@@ -443,6 +444,7 @@ int joint_solve(struct joint_result *out, const struct texels *texels, const str
     if (!err) {
         doubt(&s, out, n_fit_views);
         out->n_jacobians = s.n_jacobians;
+        out->n_sweep_jacobians = s.n_sweep_jacobians;
         out->n_evaluations = s.n_evaluations;
         out->w_sim = s.w_sim;
         out->w_sim_sum = set->method == METHOD_ALTERNATING ? s.w_sim_sum : s.w_sim * s.n_residuals;

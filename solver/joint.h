@@ -23,6 +23,7 @@ struct joint_settings {
     double w_sim;            // weight of Eq. 11 beside the *mean* of squared residuals. alternating: 3e-9 (default), held. joint: the last
                              // weight of the continuation; negative: stopped by the views set aside (default)
     bool visibility;         // trace shadows, and again when lights have moved
+    bool continuation;       // joint: w_sim falls by decades; without, the search begins at w_sim itself
     bool planes;             // joint: lights that lie on one plane, if the views set aside accept it, stay on it
     bool robust;             // down-weight outliers in the last stage
     bool gain;               // one unknown exposure factor per camera (prior 2 %)
@@ -44,6 +45,7 @@ struct joint_result {
     double rmse_fit_percent, rmse_held_out_percent; // samples; -1: no view held out
     int64_t n_fit, n_held_out;
     int n_jacobians, n_evaluations;
+    int n_sweep_jacobians;           // of n_jacobians: of the sweep's 17 unknowns, at few texels
     double w_sim;                    // the last one, our normalisation (mean); w_sim_sum: beside the sum
     double w_sim_sum;
     const char *stop_reason;

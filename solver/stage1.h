@@ -26,7 +26,7 @@ struct stage1 {
     double *x, *lower, *upper;
     struct light_visibility visibility;
     const struct rays *rays;
-    int n_jacobians, n_evaluations;
+    int n_jacobians, n_sweep_jacobians, n_evaluations;
     const char *stop;         // why the last minimise stopped
 };
 

@@ -80,11 +80,13 @@ static inline int stability_n_sub(const struct studio *s, enum method method)
 
 static inline int stability_cut(struct lights *out, const struct studio *s, const struct panorama *p, int n_sub)
 {
-    const int err = lights_median_cut(out, p, s->size.n_lights * n_sub);
+    struct lights cut;
+    int err = lights_median_cut(&cut, p, s->size.n_lights);
+    if (!err)
+        err = lights_refine(out, &cut, p, s->size.n_lights * n_sub);
+    lights_free(&cut);
     if (err)
         return err;
-    for (int i = 0; i < out->n; i++) // aligned runs are the regions of the coarser cut
-        out->group[i] = i / n_sub;
     memcpy(out->centre_m, s->truth.centre_m, sizeof(out->centre_m));
     memcpy(out->world_from_probe, s->truth.world_from_probe, sizeof(out->world_from_probe));
     return 0;

@@ -23,7 +23,7 @@ struct settings {
     const char *out, *preset, *hold_out;
     struct joint_settings joint;
     double w_sim;
-    bool has_w_sim, no_visibility, no_planes, json;
+    bool has_w_sim, no_visibility, no_planes, no_continuation, footprint_mean, json;
     int texture, n_lights, n_sub, n_threads;
     uint64_t seed;
     struct inputs in;
@@ -32,7 +32,7 @@ struct settings {
 enum {
     OPTION_PRESET = 512, OPTION_METHOD,
     OPTION_TEXTURE, OPTION_LIGHTS, OPTION_SUB_LIGHTS, OPTION_HOLD_OUT, OPTION_THREADS, OPTION_SEED, OPTION_JSON,
-    OPTION_REFLECTANCE, OPTION_ALBEDO, OPTION_DISTANCE, OPTION_W_SIM, OPTION_NO_PLANES, OPTION_NO_VISIBILITY, OPTION_ROBUST, OPTION_GAIN,
+    OPTION_REFLECTANCE, OPTION_ALBEDO, OPTION_DISTANCE, OPTION_W_SIM, OPTION_NO_PLANES, OPTION_NO_CONTINUATION, OPTION_FOOTPRINT_MEAN, OPTION_NO_VISIBILITY, OPTION_ROBUST, OPTION_GAIN,
     OPTION_VERBOSE,
 };
 
@@ -48,6 +48,8 @@ static const struct argp_option options[] = {
     { "distance", OPTION_DISTANCE, "M", 0, "first distance of all lights (joint: swept; alternating: 2)", 2 },
     { "w-sim", OPTION_W_SIM, "W", 0, "weight of the similarity term beside the mean of squares: alternating 3e-9; joint: the last one "
       "(default: chosen by views set aside)", 2 },
+    { "footprint-mean", OPTION_FOOTPRINT_MEAN, 0, 0, "a sample is the mean over its footprint, not the value at its centre", 2 },
+    { "no-continuation", OPTION_NO_CONTINUATION, 0, 0, "joint: begin at --w-sim itself", 2 },
     { "no-planes", OPTION_NO_PLANES, 0, 0, "joint: do not look for lights that lie on one plane", 2 },
     { "no-visibility", OPTION_NO_VISIBILITY, 0, 0, "every light reaches every texel above its horizon", 2 },
     { "robust", OPTION_ROBUST, 0, 0, "down-weight outliers in the last stage", 2 },
@@ -111,6 +113,12 @@ static error_t parse_option(int key, char *text, struct argp_state *state)
         s->w_sim = argument_number(state, "--w-sim", text, "a number", 0, 1e6);
         s->has_w_sim = true;
         return 0;
+    case OPTION_NO_CONTINUATION:
+        s->no_continuation = true;
+        return 0;
+    case OPTION_FOOTPRINT_MEAN:
+        s->footprint_mean = true;
+        return 0;
     case OPTION_NO_PLANES:
         s->no_planes = true;
         return 0;
@@ -146,6 +154,8 @@ static error_t parse_option(int key, char *text, struct argp_state *state)
         s->out = text;
         return 0;
     case ARGP_KEY_END:
+        if (s->no_continuation && !s->has_w_sim)
+            argp_error(state, "--no-continuation: give the weight to begin (and end) with by --w-sim");
         if (!s->out)
             argp_error(state, "no -o DIR: where shall the result go?");
         return 0;
@@ -208,6 +218,7 @@ static int load(struct scene *scene, struct settings *s)
     struct samples_settings gather = samples_defaults();
     struct lights cut = { 0 };
     gather.n_threads = s->n_threads;
+    gather.at_centre = !s->footprint_mean;
     s->in.needs = TAKE_MESH | TAKE_CAMERAS | TAKE_PANORAMA | TAKE_VIEWS;
     s->in.texture = s->texture;
     int err = inputs_load(&s->in);
@@ -300,6 +311,9 @@ static struct json *make_report(const struct scene *scene, const struct settings
     json_set_number(o, "w_sim_mean", r->w_sim);
     json_set_number(o, "w_sim_sum", r->w_sim_sum);
     json_set_int(o, "n_jacobians", r->n_jacobians);
+    json_set_int(o, "n_sweep_jacobians", r->n_sweep_jacobians);
+    json_set_number(o, "structure", r->misfit.structure);
+    json_set_number(o, "distance_std_relative", r->distance_std_relative);
     json_set_int(o, "n_evaluations", r->n_evaluations);
     json_set_string(o, "stop_reason", r->stop_reason);
     json_set_bool(o, "trusted", r->doubts == 0);
@@ -389,6 +403,7 @@ int command_solve(int argc, char **argv)
     s.joint.w_sim = s.has_w_sim ? s.w_sim : defaults.w_sim;
     s.joint.visibility = defaults.visibility && !s.no_visibility;
     s.joint.planes = defaults.planes && !s.no_planes;
+    s.joint.continuation = !s.no_continuation;
     s.joint.n_threads = s.n_threads;
     if (!s.n_sub)
         s.n_sub = s.joint.method == METHOD_JOINT ? 4 : 1;
