@@ -1,12 +1,10 @@
 // solver/joint.c - stage 1 of the solver: three methods over photometric.h and lm.h.
-#include "solver/joint.h"
+#include "solver/stage1.h"
 
 #include "solver/lm.h"
-#include "solver/parallel.h"
 #include "solver/take/log.h"
 #include "solver/take/progress.h"
 #include "solver/vec3.h"
-#include "solver/visibility.h"
 
 #include <errno.h>
 #include <stdlib.h>
@@ -39,371 +37,9 @@ const char *joint_doubt_text(unsigned one_bit)
     return "";
 }
 
-enum { N_NEIGHBOURS = 8 };
-static const double least_q = .02, most_q = 5; // 50 m .. 20 cm
-static const double centre_guess_m = .3;       // how well the centre of the panorama is known at the start
-static const double first_w_sim = 1e-3;        // of the continuation, and of the sweep
-
-struct pair {
-    int i, j;
-    double weight; // 1 / |dh_i - dh_j|^2
-};
-
-struct stage1 {
-    const struct joint_settings *set;
-    struct photometric p;
-    struct photometric_layout layout;
-    struct photometric_state base, trial;
-    int n_pairs;
-    struct pair *pairs;
-    bool in_distance;      // the unknown is r, not 1/r, and E_sim is Eq. 11 to the letter (paper)
-    double w_sim;          // beside the mean of squares
-    double first_centre_m[3]; // joint: the centre is held near its first guess with the same weight, which ends at (nearly) 0
-    double n_residuals;    // samples x 3 in use
-    unsigned char *is_free;
-    double *x, *lower, *upper;
-    struct light_visibility visibility;
-    const struct rays *rays;
-    int n_jacobians, n_evaluations;
-    const char *stop;
-};
-
-// ---- E_sim --------------------------------------------------------------------------------------------------------------
-
-// The group's direction: energy-weighted. Groups without energy are left out of everything.
-static int find_pairs(struct stage1 *s, const struct lights *l)
-{
-    const int n = s->p.n_groups;
-    double(*d)[3] = calloc((size_t)n, sizeof(*d));
-    unsigned char *lit = calloc((size_t)n, 1);
-    s->pairs = malloc((size_t)n * N_NEIGHBOURS * sizeof(*s->pairs));
-    int err = d && lit && s->pairs ? 0 : -ENOMEM;
-    for (int i = 0; !err && i < l->n; i++) {
-        const int g = s->p.group_of_light[i];
-        const double energy = l->irradiance[i][0] + l->irradiance[i][1] + l->irradiance[i][2];
-        vec3_add_scaled(d[g], d[g], energy, l->dir_probe[i]);
-        lit[g] |= energy > 0;
-    }
-    for (int g = 0; !err && g < n; g++) {
-        vec3_normalise(d[g]);
-        s->is_free[s->layout.inverse_distance + g] = lit[g];
-    }
-    s->n_pairs = 0;
-    for (int g = 0; !err && g < n; g++) {
-        int nearest[N_NEIGHBOURS], m = 0;
-        double distance2[N_NEIGHBOURS];
-        for (int h = 0; h < n && lit[g]; h++) {
-            double e[3];
-            vec3_sub(e, d[g], d[h]);
-            const double d2 = vec3_dot(e, e);
-            if (h == g || !lit[h] || (m == N_NEIGHBOURS && d2 >= distance2[m - 1]))
-                continue;
-            int k = m < N_NEIGHBOURS ? m++ : m - 1;
-            for (; k > 0 && distance2[k - 1] > d2; k--)
-                nearest[k] = nearest[k - 1], distance2[k] = distance2[k - 1];
-            nearest[k] = h, distance2[k] = d2;
-        }
-        for (int k = 0; k < m; k++) // each direction of a neighbourhood counts, as in Eq. 11
-            s->pairs[s->n_pairs++] = (struct pair){ g, nearest[k], 1 / fmax(distance2[k], 1e-6) };
-    }
-    free(d);
-    free(lit);
-    return err;
-}
-
-// u(x): log(1/r), or r itself in paper mode; and du/dx.
-static double similarity_of(const struct stage1 *s, double x, double *slope)
-{
-    if (s->in_distance) {
-        *slope = 1;
-        return x;
-    }
-    *slope = 1 / x;
-    return log(x);
-}
-
-// Eq. 11, and for joint the first guess of the centre.
-static double add_similarity(const struct stage1 *s, const double *x, double *A, double *g)
-{
-    const int first = s->layout.inverse_distance, n = s->layout.n;
-    double cost = 0;
-    for (int k = 0; s->w_sim > 0 && k < s->n_pairs; k++) {
-        const int i = first + s->pairs[k].i, j = first + s->pairs[k].j;
-        double si, sj;
-        const double w = s->w_sim * s->pairs[k].weight;
-        const double e = similarity_of(s, x[i], &si) - similarity_of(s, x[j], &sj);
-        cost += .5 * w * e * e;
-        if (!A)
-            continue;
-        g[i] += w * e * si, g[j] -= w * e * sj;
-        A[(size_t)i * n + i] += w * si * si, A[(size_t)j * n + j] += w * sj * sj;
-        A[(size_t)(i > j ? i : j) * n + (i > j ? j : i)] -= w * si * sj;
-    }
-    for (int c = 0; s->set->method == METHOD_JOINT && c < 3; c++) {
-        const int i = s->layout.centre + c;
-        const double w = s->w_sim / (centre_guess_m * centre_guess_m), e = x[i] - s->first_centre_m[c];
-        cost += .5 * w * e * e;
-        if (A)
-            A[(size_t)i * n + i] += w, g[i] += w * e;
-    }
-    return cost;
-}
-
-// ---- the problem as lm.h sees it ----------------------------------------------------------------------------------------
-
-static double gain_precision(void)
-{
-    return 1 / (.02 * .02);
-}
-
-static void to_state(struct stage1 *s, const double *x, double *scratch)
-{
-    memcpy(scratch, x, (size_t)s->layout.n * sizeof(double));
-    for (int g = 0; s->in_distance && g < s->p.n_groups; g++)
-        scratch[s->layout.inverse_distance + g] = 1 / x[s->layout.inverse_distance + g];
-    photometric_state_copy(&s->p, &s->trial, &s->base);
-    photometric_unpack(&s->p, &s->trial, scratch);
-}
-
-static int evaluate_at(struct stage1 *s, const double *x, double *cost)
-{
-    double scratch[s->layout.n];
-    struct photometric_error e;
-    to_state(s, x, scratch);
-    const int err = photometric_evaluate(&s->p, &s->trial, s->p.albedo == ALBEDO_FREE, &e);
-    if (err)
-        return err;
-    s->n_residuals = 3 * (double)e.n;
-    *cost = e.cost / fmax(s->n_residuals, 1) + add_similarity(s, x, NULL, NULL);
-    for (int v = 0; s->set->gain && v < s->layout.n_views; v++) {
-        const double gain = x[s->layout.gain + v];
-        *cost += .5 * 1e-6 * gain_precision() * gain * gain / s->layout.n_views;
-    }
-    return 0;
-}
-
-static int cost_callback(void *arg, const double *x, double *cost)
-{
-    struct stage1 *s = arg;
-    s->n_evaluations++;
-    return evaluate_at(s, x, cost);
-}
-
-// A, g for the step w at R = exp([w]x) R0 instead of w = 0: columns times the left Jacobian of the rotation.
-static void turn_rotation(const struct stage1 *s, const double *x, double *A, double *g)
-{
-    const int n = s->layout.n, first = s->layout.rotation;
-    const double *w = x + first, a2 = vec3_dot(w, w), a = sqrt(a2);
-    if (a2 == 0)
-        return;
-    const double k1 = a > 1e-4 ? (1 - cos(a)) / a2 : .5, k2 = a > 1e-4 ? (a - sin(a)) / (a2 * a) : 1. / 6;
-    const double W[9] = { 0, -w[2], w[1], w[2], 0, -w[0], -w[1], w[0], 0 };
-    double W2[9], T[9];
-    mat3_mul(W2, W, W);
-    for (int i = 0; i < 9; i++)
-        T[i] = (i % 4 == 0) + k1 * W[i] + k2 * W2[i];
-    // rows and columns of the symmetric matrix (lower triangle held)
-    for (int i = 0; i < n; i++) {
-        if (i >= first && i < first + 3)
-            continue;
-        double v[3];
-        for (int c = 0; c < 3; c++)
-            v[c] = i > first + c ? A[(size_t)i * n + first + c] : A[(size_t)(first + c) * n + i];
-        mat3_tmul_vec(v, T, v);
-        for (int c = 0; c < 3; c++)
-            *(i > first + c ? &A[(size_t)i * n + first + c] : &A[(size_t)(first + c) * n + i]) = v[c];
-    }
-    double B[9], Tt[9];
-    for (int i = 0; i < 3; i++)
-        for (int c = 0; c < 3; c++) {
-            B[3 * i + c] = i >= c ? A[(size_t)(first + i) * n + first + c] : A[(size_t)(first + c) * n + first + i];
-            Tt[3 * i + c] = T[3 * c + i];
-        }
-    mat3_mul(B, Tt, B);
-    mat3_mul(B, B, T);
-    for (int i = 0; i < 3; i++)
-        for (int c = 0; c <= i; c++)
-            A[(size_t)(first + i) * n + first + c] = B[3 * i + c];
-    mat3_tmul_vec(g + first, T, g + first);
-}
-
-static int normal_callback(void *arg, const double *x, double *cost, double *A, double *g)
-{
-    struct stage1 *s = arg;
-    const int n = s->layout.n;
-    int err = evaluate_at(s, x, cost);
-    if (err)
-        return err;
-    s->n_jacobians++;
-    err = photometric_normal_equations(&s->p, &s->trial, s->is_free, A, g);
-    if (err)
-        return err;
-    const double scale = 1 / fmax(s->n_residuals, 1);
-    for (int i = 0; i < n; i++) {
-        g[i] *= scale;
-        for (int j = 0; j <= i; j++)
-            A[(size_t)i * n + j] *= scale;
-    }
-    for (int k = 0; s->in_distance && k < s->p.n_groups; k++) { // d/dr = -1/r^2 d/dq
-        const int i = s->layout.inverse_distance + k;
-        const double slope = -1 / (x[i] * x[i]);
-        g[i] *= slope;
-        for (int j = 0; j <= i; j++)
-            A[(size_t)i * n + j] *= slope;
-        for (int j = i; j < n; j++)
-            A[(size_t)j * n + i] *= slope;
-    }
-    turn_rotation(s, x, A, g);
-    for (int v = 0; s->set->gain && v < s->layout.n_views; v++) {
-        const int i = s->layout.gain + v;
-        const double w = 1e-6 * gain_precision() / s->layout.n_views;
-        A[(size_t)i * n + i] += w, g[i] += w * x[i];
-    }
-    add_similarity(s, x, A, g);
-    // The colour of the tint in the next evaluations.
-    memcpy(s->base.albedo, s->trial.albedo, (size_t)s->p.texels->n * sizeof(*s->base.albedo));
-    return 0;
-}
-
-static void set_bounds(struct stage1 *s)
-{
-    const struct photometric_layout *l = &s->layout;
-    for (int i = 0; i < l->n; i++)
-        s->lower[i] = -INFINITY, s->upper[i] = INFINITY;
-    for (int i = 0; i < DISNEY_N; i++)
-        s->lower[l->theta + i] = 0, s->upper[l->theta + i] = 1;
-    for (int i = 0; i < 3; i++) {
-        s->lower[l->albedo + i] = 0, s->upper[l->albedo + i] = 1.5;
-        s->lower[l->rotation + i] = -1, s->upper[l->rotation + i] = 1;
-    }
-    for (int g = 0; g < l->n_groups; g++) {
-        s->lower[l->inverse_distance + g] = s->set->method == METHOD_DIRECTIONAL ? 0 : s->in_distance ? 1 / most_q : least_q;
-        s->upper[l->inverse_distance + g] = s->in_distance ? 1 / least_q : most_q;
-    }
-}
-
-static int trace_visibility(struct stage1 *s)
-{
-    if (!s->set->visibility || !s->rays)
-        return 0;
-    const double moved_rad = .5 * M_PI / 180;
-    const int err = s->visibility.bits
-                        ? light_visibility_refresh(&s->visibility, s->rays, s->p.texels, &s->base.lights, NULL, moved_rad, 0,
-                                                   s->set->n_threads)
-                        : light_visibility_trace(&s->visibility, s->rays, s->p.texels, &s->base.lights, NULL, 1, 0,
-                                                 s->set->n_threads);
-    s->p.visible = s->visibility.bits;
-    s->p.words_per_texel = s->visibility.words_per_texel;
-    return err < 0 ? err : 0; // refresh counts
-}
-
-// LM from base; base is the result. cost may be NULL.
-static int minimise(struct stage1 *s, int max_iterations, double relative_cost, double *cost)
-{
-    const struct lm_problem problem = { s->layout.n, s->lower, s->upper, cost_callback, normal_callback, s };
-    struct lm_settings settings = lm_defaults();
-    struct lm_result r;
-    double scratch[s->layout.n];
-    settings.max_iterations = max_iterations;
-    settings.relative_cost = relative_cost;
-    photometric_pack(&s->p, &s->base, s->x);
-    for (int g = 0; s->in_distance && g < s->p.n_groups; g++)
-        s->x[s->layout.inverse_distance + g] = 1 / s->x[s->layout.inverse_distance + g];
-    int err = lm_minimise(&problem, &settings, s->x, &r);
-    if (err)
-        return err;
-    to_state(s, s->x, scratch);
-    struct photometric_error e;
-    err = photometric_evaluate(&s->p, &s->trial, s->p.albedo == ALBEDO_FREE, &e);
-    photometric_state_copy(&s->p, &s->base, &s->trial);
-    s->stop = lm_stop_name(r.stop);
-    if (cost)
-        *cost = r.cost;
-    log_debug("joint: w_sim %.1e, step %d, %d groups: cost %.4e -> %.4e, %d Jacobians, stop %s, RMSE %.4f %%", s->w_sim, s->p.texel_step,
-              s->p.n_groups, r.first_cost, r.cost, r.n_jacobians, s->stop, photometric_rmse_percent(&e));
-    return err;
-}
-
-static void set_distances(struct stage1 *s, double distance_m)
-{
-    for (int i = 0; i < s->base.lights.n; i++)
-        s->base.lights.inverse_distance[i] = distance_m > 0 ? 1 / distance_m : 0;
-}
-
 // ---- the stages of a solve ----------------------------------------------------------------------------------------------
 
-static int stage1_new(struct stage1 *s, const struct photometric *p, const struct lights *lights, const struct rays *rays,
-                      const struct joint_settings *set)
-{
-    memset(s, 0, sizeof(*s));
-    s->set = set, s->p = *p, s->rays = rays;
-    s->layout = photometric_layout_of(p->samples->n_views, p->n_groups);
-    s->in_distance = set->method == METHOD_ALTERNATING;
-    memcpy(s->first_centre_m, lights->centre_m, sizeof(s->first_centre_m));
-    const size_t n = (size_t)s->layout.n;
-    s->is_free = calloc(n, 1);
-    s->x = calloc(n, sizeof(double));
-    s->lower = calloc(n, sizeof(double));
-    s->upper = calloc(n, sizeof(double));
-    if (!s->is_free || !s->x || !s->lower || !s->upper)
-        return -ENOMEM;
-    int err = photometric_state_new(&s->base, p, lights);
-    if (!err)
-        err = photometric_state_new(&s->trial, p, lights);
-    if (!err)
-        err = find_pairs(s, lights);
-    if (err)
-        return err;
-    for (int i = 0; i < DISNEY_N; i++)
-        s->is_free[s->layout.theta + i] = p->model == REFLECT_DISNEY;
-    for (int i = 0; i < 3; i++) {
-        s->is_free[s->layout.rotation + i] = 1;
-        s->is_free[s->layout.centre + i] = set->method != METHOD_DIRECTIONAL;
-        s->is_free[s->layout.albedo + i] = p->albedo == ALBEDO_SHARED;
-    }
-    for (int v = 0; v < s->layout.n_views; v++)
-        s->is_free[s->layout.gain + v] = set->gain;
-    for (int g = 0; g < p->n_groups; g++)
-        s->is_free[s->layout.inverse_distance + g] &= set->method != METHOD_DIRECTIONAL;
-    for (int t = 0; p->albedo == ALBEDO_GIVEN && t < p->texels->n; t++)
-        for (int c = 0; c < 3; c++)
-            s->base.albedo[t][c] = (float)set->given_albedo[c];
-    set_bounds(s);
-    return 0;
-}
-
-static void stage1_free(struct stage1 *s)
-{
-    photometric_state_free(&s->base);
-    photometric_state_free(&s->trial);
-    light_visibility_free(&s->visibility);
-    free(s->pairs);
-    free(s->is_free);
-    free(s->x);
-    free(s->lower);
-    free(s->upper);
-    memset(s, 0, sizeof(*s));
-}
-
-// Over the texels that the views in s->p saw: others have no albedo to be judged.
-static int measure(const struct stage1 *s, const struct photometric_state *state, const uint8_t *use_view,
-                   struct photometric_error *e)
-{
-    const struct samples *m = s->p.samples;
-    struct photometric p = s->p;
-    uint8_t *fitted = calloc((size_t)m->n_texels, 1);
-    if (!fitted)
-        return -ENOMEM;
-    for (int t = 0; t < m->n_texels; t++)
-        for (int64_t i = m->first[t]; i < m->first[t + 1]; i++)
-            fitted[t] |= !s->p.use_view || s->p.use_view[m->view[i]];
-    p.use_view = use_view;
-    p.use_texel = fitted;
-    p.weight = NULL;
-    const int err = photometric_evaluate(&p, (struct photometric_state *)state, false, e);
-    free(fitted);
-    return err;
-}
+static const double first_w_sim = 1e-3; // of the continuation, and of the sweep
 
 // Runs of `run` lights become one: the sum of their irradiance, from its mean direction.
 static int merge_lights(struct lights *out, const struct lights *fine, int run)
@@ -427,13 +63,6 @@ static int merge_lights(struct lights *out, const struct lights *fine, int run)
     }
     return 0;
 }
-
-// Every so many texels, so that about n_samples are left; odd, so as not to fall in step with the texture's rows.
-static int step_for(const struct stage1 *s, int64_t n_samples)
-{
-    const int64_t step = s->p.samples->n / n_samples;
-    return step < 1 ? 1 : (int)step | 1;
-}
 // Few are enough to follow the valley, more to tell one weight from the next and for the last word; the albedo is then
 // solved for every texel.
 enum { SWEEP_SAMPLES = 30000, COARSE_SAMPLES = 30000, FINE_SAMPLES = 200000 };
@@ -451,18 +80,18 @@ static int sweep(const struct photometric *p, const struct lights *lights, const
     coarse.group_of_light = one_group;
     coarse.n_groups = 1;
     const struct stage1 all = { .p = *p };
-    coarse.texel_step = step_for(&all, SWEEP_SAMPLES);
+    coarse.texel_step = stage1_step_for(&all, SWEEP_SAMPLES);
     const int n = set->start_distance_m > 0 ? 1 : (int)(sizeof(distances_m) / sizeof(distances_m[0]));
     for (int k = 0; !err && k < n; k++) {
         double cost;
         err = stage1_new(&s, &coarse, lights, rays, set);
         if (!err) {
-            set_distances(&s, n == 1 ? set->start_distance_m : distances_m[k]);
-            err = trace_visibility(&s);
+            stage1_set_distances(&s, n == 1 ? set->start_distance_m : distances_m[k]);
+            err = stage1_trace_visibility(&s);
         }
         if (!err) {
             s.w_sim = first_w_sim;
-            err = minimise(&s, 12, 1e-4, &cost);
+            err = stage1_minimise(&s, 12, 1e-4, &cost);
         }
         if (!err && cost < *best_cost) {
             *best_cost = cost;
@@ -492,15 +121,15 @@ static int continuation(struct stage1 *s, const uint8_t *aside)
     for (double w = first_w_sim; !err && n < MAX_STEPS; w = w > 1e-13 ? w / 10 : 0) {
         struct photometric_error e;
         s->w_sim = weight[n] = w > last ? w : last;
-        s->p.texel_step = step_for(s, COARSE_SAMPLES);
-        err = trace_visibility(s);
+        s->p.texel_step = stage1_step_for(s, COARSE_SAMPLES);
+        err = stage1_trace_visibility(s);
         if (!err)
-            err = minimise(s, 8, 2e-3, NULL);
-        s->p.texel_step = step_for(s, FINE_SAMPLES);
+            err = stage1_minimise(s, 8, 2e-3, NULL);
+        s->p.texel_step = stage1_step_for(s, FINE_SAMPLES);
         if (!err) // the albedo of more texels, for the views set aside
             err = photometric_evaluate(&s->p, &s->base, s->p.albedo == ALBEDO_FREE, &e);
         if (!err)
-            err = measure(s, &s->base, aside, &e);
+            err = stage1_measure(s, &s->base, aside, &e);
         if (!err)
             err = photometric_state_new(&at[n], &s->p, &s->base.lights);
         progress_add(1);
@@ -534,8 +163,8 @@ static int refine(struct stage1 *s, const uint8_t *fit)
     float *weight = NULL;
     struct photometric_error e;
     s->p.use_view = fit;
-    s->p.texel_step = step_for(s, FINE_SAMPLES);
-    int err = trace_visibility(s);
+    s->p.texel_step = stage1_step_for(s, FINE_SAMPLES);
+    int err = stage1_trace_visibility(s);
     if (!err && s->set->robust) {
         double sigma;
         weight = malloc((size_t)s->p.samples->n * sizeof(float) + 1);
@@ -545,7 +174,7 @@ static int refine(struct stage1 *s, const uint8_t *fit)
         s->p.weight = weight;
     }
     if (!err)
-        err = minimise(s, s->set->method == METHOD_JOINT ? 15 : 40, 1e-4, NULL);
+        err = stage1_minimise(s, s->set->method == METHOD_JOINT ? 15 : 40, 1e-4, NULL);
     s->p.weight = NULL;
     s->p.texel_step = 1;
     if (!err)
@@ -626,119 +255,6 @@ end:
     return err;
 }
 
-// ---- the paper's alternation ----------------------------------------------------------------------------------------
-
-static int by_luminance(const void *a, const void *b)
-{
-    const float x = *(const float *)a, y = *(const float *)b;
-    return (x > y) - (x < y);
-}
-
-// Per texel: the darkest quarter (at least 3) into low; the brightest quarter that exceeds 1.3 x the predicted diffuse into high.
-static int split_by_luminosity(const struct stage1 *s, float *low, float *high)
-{
-    const struct samples *m = s->p.samples;
-    struct light_arrays lights;
-    int err = light_arrays_new(&lights, &s->base.lights);
-    const struct kernels *k = kernels_select(KERNELS_ALL);
-    float sorted[2048];
-    for (int t = 0; !err && t < s->p.texels->n; t++) {
-        int n = 0;
-        for (int64_t i = m->first[t]; i < m->first[t + 1]; i++) {
-            float rgb[3];
-            samples_radiance(m, i, rgb);
-            low[i] = high[i] = 0;
-            if (s->p.use_view && !s->p.use_view[m->view[i]])
-                continue;
-            if (n < 2048)
-                sorted[n++] = rgb[0] + rgb[1] + rgb[2];
-        }
-        if (!n)
-            continue;
-        qsort(sorted, (size_t)n, sizeof(float), by_luminance);
-        const int quarter = n / 4;
-        const float dark = sorted[quarter < 3 ? (n < 3 ? n : 3) - 1 : quarter - 1], bright = sorted[n - 1 - quarter];
-        struct surface_point point = { 0 };
-        memcpy(point.position_m, s->p.texels->position_m[t], sizeof(point.position_m));
-        memcpy(point.normal, s->p.texels->normal[t], sizeof(point.normal));
-        float E[3], diffuse = 0;
-        k->irradiance(E, &lights, &point, NULL);
-        for (int c = 0; c < 3; c++)
-            diffuse += E[c] * s->base.albedo[t][c] * (float)M_1_PI;
-        for (int64_t i = m->first[t]; i < m->first[t + 1]; i++) {
-            float rgb[3];
-            samples_radiance(m, i, rgb);
-            const float sum = rgb[0] + rgb[1] + rgb[2];
-            if (s->p.use_view && !s->p.use_view[m->view[i]])
-                continue;
-            low[i] = sum <= dark;
-            high[i] = sum >= bright && sum > 1.3f * diffuse;
-        }
-    }
-    if (!err)
-        light_arrays_free(&lights);
-    return err;
-}
-
-static int solve_alternating(struct stage1 *s, const uint8_t *fit)
-{
-    const size_t n = (size_t)s->p.samples->n;
-    float *low = malloc((n + 1) * sizeof(float)), *high = malloc((n + 1) * sizeof(float));
-    struct photometric_error e;
-    int err = low && high ? 0 : -ENOMEM;
-    s->p.use_view = fit;
-    s->p.texel_step = 1;
-    const double start_m = s->set->start_distance_m > 0 ? s->set->start_distance_m : 2;
-    set_distances(s, start_m);
-    s->stop = "cost";
-    if (!err && s->p.model == REFLECT_LAMBERT) { // data sets 1 and 2: the albedo is known or shared, so there is nothing to alternate
-        err = photometric_evaluate(&s->p, &s->base, false, &e);
-        s->w_sim = s->set->w_sim / fmax(3 * (double)e.n, 1);
-        if (!err)
-            err = minimise(s, 60, 1e-6, NULL);
-        goto end;
-    }
-    progress_begin("alternating", 30);
-    set_distances(s, 0); // Eq. 8
-    for (int round = 0; !err && round < 30; round++) {
-        struct photometric dark = s->p;
-        dark.model = REFLECT_LAMBERT, dark.albedo = ALBEDO_FREE, dark.weight = low;
-        err = split_by_luminosity(s, low, high);
-        if (!err)
-            err = photometric_evaluate(&dark, &s->base, true, &e);
-        if (!err)
-            err = split_by_luminosity(s, low, high); // with the new albedo
-        if (round == 0)
-            set_distances(s, start_m);
-        if (err)
-            break;
-        s->p.weight = high, s->p.albedo = ALBEDO_GIVEN;
-        err = photometric_evaluate(&s->p, &s->base, false, &e);
-        if (err)
-            break;
-        if (!e.n) {
-            s->stop = "no bright samples";
-            break;
-        }
-        s->w_sim = s->set->w_sim / (3 * (double)e.n);
-        const double before = e.cost;
-        err = minimise(s, 20, 1e-6, NULL);
-        if (!err)
-            err = photometric_evaluate(&s->p, &s->base, false, &e);
-        progress_add(1);
-        if (!err && round > 0 && fabs(before - e.cost) < 1e-4 * before)
-            break;
-        if (round == 29)
-            s->stop = "max_iterations";
-    }
-    progress_end();
-end:
-    s->p.weight = NULL;
-    free(low);
-    free(high);
-    return err;
-}
-
 // ---- the answer -----------------------------------------------------------------------------------------------------------
 
 // Standard deviations from the final normal equations: sigma^2 A^-1, sigma from the residuals' own mean square.
@@ -747,20 +263,16 @@ static int uncertainty(struct stage1 *s, struct joint_result *out)
     const size_t n = (size_t)s->layout.n;
     double *A = calloc(n * n, sizeof(double)), *C = calloc(n * n, sizeof(double)), *g = calloc(n, sizeof(double)), cost;
     int err = A && C && g ? 0 : -ENOMEM;
-    photometric_pack(&s->p, &s->base, s->x);
-    const bool in_distance = s->in_distance;
-    s->in_distance = false; // of 1/r
     const double w_sim = s->w_sim;
-    if (in_distance)
+    if (s->in_distance)
         s->w_sim = 0;
-    s->p.texel_step = step_for(s, FINE_SAMPLES);
+    s->p.texel_step = stage1_step_for(s, FINE_SAMPLES);
     if (!err)
-        err = normal_callback(s, s->x, &cost, A, g);
-    s->in_distance = in_distance;
+        err = stage1_normal_equations(s, &cost, A, g);
     s->w_sim = w_sim;
     if (!err) {
         struct photometric_error e;
-        err = measure(s, &s->base, s->p.use_view, &e);
+        err = stage1_measure(s, &s->base, s->p.use_view, &e);
         out->objective = 2 * e.cost / fmax(3 * (double)e.n, 1);
         // A is of the mean of squares: covariance = sigma^2 / n_residuals A^-1.
         unsigned char is_free[n];
@@ -853,21 +365,21 @@ int joint_solve(struct joint_result *out, const struct texels *texels, const str
     if (!err && set->method == METHOD_JOINT) {
         err = solve_joint(&s, &p, lights, fit, out);
     } else if (!err && set->method == METHOD_ALTERNATING) {
-        err = solve_alternating(&s, fit);
+        err = stage1_alternate(&s, fit);
     } else if (!err) {
-        set_distances(&s, 0);
+        stage1_set_distances(&s, 0);
         err = refine(&s, fit);
     }
     struct photometric_error e;
     if (!err)
         err = uncertainty(&s, out);
     if (!err)
-        err = measure(&s, &s.base, fit, &e);
+        err = stage1_measure(&s, &s.base, fit, &e);
     if (!err) {
         out->rmse_fit_percent = photometric_rmse_percent(&e);
         out->n_fit = e.n;
         out->rmse_held_out_percent = -1;
-        if (n_held && !(err = measure(&s, &s.base, held, &e))) {
+        if (n_held && !(err = stage1_measure(&s, &s.base, held, &e))) {
             out->rmse_held_out_percent = photometric_rmse_percent(&e);
             out->n_held_out = e.n;
         }

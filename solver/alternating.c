@@ -1,0 +1,122 @@
+// solver/alternating.c - the paper's alternation (Eqs. 8-12), as plainly as it can be had: the yardstick for joint.c.
+#include "solver/stage1.h"
+
+#include "solver/take/log.h"
+#include "solver/take/progress.h"
+#include "solver/vec3.h"
+
+#include <errno.h>
+#include <stdlib.h>
+#include <string.h>
+
+static int by_luminance(const void *a, const void *b)
+{
+    const float x = *(const float *)a, y = *(const float *)b;
+    return (x > y) - (x < y);
+}
+
+// Per texel: the darkest quarter (at least 3) into low; the brightest quarter that exceeds 1.3 x the predicted diffuse into high.
+static int split_by_luminosity(const struct stage1 *s, float *low, float *high)
+{
+    const struct samples *m = s->p.samples;
+    struct light_arrays lights;
+    int err = light_arrays_new(&lights, &s->base.lights);
+    const struct kernels *k = kernels_select(KERNELS_ALL);
+    float sorted[2048];
+    for (int t = 0; !err && t < s->p.texels->n; t++) {
+        int n = 0;
+        for (int64_t i = m->first[t]; i < m->first[t + 1]; i++) {
+            float rgb[3];
+            samples_radiance(m, i, rgb);
+            low[i] = high[i] = 0;
+            if (s->p.use_view && !s->p.use_view[m->view[i]])
+                continue;
+            if (n < 2048)
+                sorted[n++] = rgb[0] + rgb[1] + rgb[2];
+        }
+        if (!n)
+            continue;
+        qsort(sorted, (size_t)n, sizeof(float), by_luminance);
+        const int quarter = n / 4;
+        const float dark = sorted[quarter < 3 ? (n < 3 ? n : 3) - 1 : quarter - 1], bright = sorted[n - 1 - quarter];
+        struct surface_point point = { 0 };
+        memcpy(point.position_m, s->p.texels->position_m[t], sizeof(point.position_m));
+        memcpy(point.normal, s->p.texels->normal[t], sizeof(point.normal));
+        float E[3], diffuse = 0;
+        k->irradiance(E, &lights, &point, NULL);
+        for (int c = 0; c < 3; c++)
+            diffuse += E[c] * s->base.albedo[t][c] * (float)M_1_PI;
+        for (int64_t i = m->first[t]; i < m->first[t + 1]; i++) {
+            float rgb[3];
+            samples_radiance(m, i, rgb);
+            const float sum = rgb[0] + rgb[1] + rgb[2];
+            if (s->p.use_view && !s->p.use_view[m->view[i]])
+                continue;
+            low[i] = sum <= dark;
+            high[i] = sum >= bright && sum > 1.3f * diffuse;
+        }
+    }
+    if (!err)
+        light_arrays_free(&lights);
+    return err;
+}
+
+int stage1_alternate(struct stage1 *s, const uint8_t *fit)
+{
+    const size_t n = (size_t)s->p.samples->n;
+    float *low = malloc((n + 1) * sizeof(float)), *high = malloc((n + 1) * sizeof(float));
+    struct photometric_error e;
+    int err = low && high ? 0 : -ENOMEM;
+    s->p.use_view = fit;
+    s->p.texel_step = 1;
+    const double start_m = s->set->start_distance_m > 0 ? s->set->start_distance_m : 2;
+    stage1_set_distances(s, start_m);
+    s->stop = "cost";
+    if (!err && s->p.model == REFLECT_LAMBERT) { // data sets 1 and 2: the albedo is known or shared, so there is nothing to alternate
+        err = photometric_evaluate(&s->p, &s->base, false, &e);
+        s->w_sim = s->set->w_sim / fmax(3 * (double)e.n, 1);
+        if (!err)
+            err = stage1_minimise(s, 60, 1e-6, NULL);
+        goto end;
+    }
+    progress_begin("alternating", 30);
+    stage1_set_distances(s, 0); // Eq. 8
+    for (int round = 0; !err && round < 30; round++) {
+        struct photometric dark = s->p;
+        dark.model = REFLECT_LAMBERT, dark.albedo = ALBEDO_FREE, dark.weight = low;
+        err = split_by_luminosity(s, low, high);
+        if (!err)
+            err = photometric_evaluate(&dark, &s->base, true, &e);
+        if (!err)
+            err = split_by_luminosity(s, low, high); // with the new albedo
+        if (round == 0)
+            stage1_set_distances(s, start_m);
+        if (err)
+            break;
+        s->p.weight = high, s->p.albedo = ALBEDO_GIVEN;
+        err = photometric_evaluate(&s->p, &s->base, false, &e);
+        if (err)
+            break;
+        if (!e.n) {
+            s->stop = "no bright samples";
+            break;
+        }
+        s->w_sim = s->set->w_sim / (3 * (double)e.n);
+        const double before = e.cost;
+        err = stage1_minimise(s, 20, 1e-6, NULL);
+        if (!err)
+            err = photometric_evaluate(&s->p, &s->base, false, &e);
+        progress_add(1);
+        if (!err && round > 0 && fabs(before - e.cost) < 1e-4 * before)
+            break;
+        if (round == 29)
+            s->stop = "max_iterations";
+    }
+    progress_end();
+end:
+    s->p.weight = NULL;
+    free(low);
+    free(high);
+    return err;
+}
+

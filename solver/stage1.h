@@ -1,0 +1,46 @@
+// solver/stage1.h - stage 1 as a least-squares problem: E_photo + w_sim E_sim (Eqs. 6, 11, 12) over theta, c, R and the
+// distances, minimised by lm.h. Shared by the methods of joint.h; nobody else includes it. The methods differ in what they
+// make free, in the samples they weigh (p.weight, p.use_view, p.texel_step may be changed between two calls) and in the order of calls.
+#pragma once
+#include "solver/joint.h"
+#include "solver/visibility.h"
+
+struct stage1 {
+    const struct joint_settings *set;
+    struct photometric p;
+    struct photometric_layout layout;
+    struct photometric_state base, trial; // where the search stands, and what it tries
+    struct neighbour_pair *pairs;         // of E_sim
+    int n_pairs;
+    bool in_distance;         // the unknown is r, not 1/r, and E_sim is Eq. 11 to the letter (paper)
+    double w_sim;             // beside the mean of squares
+    double first_centre_m[3]; // joint: the centre is held near its first guess with the same weight, which ends at (nearly) 0
+    double n_residuals;       // samples x 3 in use
+    unsigned char *is_free;   // [layout.n]
+    double *x, *lower, *upper;
+    struct light_visibility visibility;
+    const struct rays *rays;
+    int n_jacobians, n_evaluations;
+    const char *stop;         // why the last minimise stopped
+};
+
+// s is zeroed first; free it even when this fails. 0 or -ENOMEM.
+int stage1_new(struct stage1 *s, const struct photometric *p, const struct lights *lights, const struct rays *rays,
+               const struct joint_settings *set);
+void stage1_free(struct stage1 *s);
+
+void stage1_set_distances(struct stage1 *s, double distance_m); // of all lights; 0: infinite
+// Traces shadows when settings ask for them; later calls only the lights that have moved by more than .5 degrees.
+int stage1_trace_visibility(struct stage1 *s);
+// From base to base. cost may be NULL. 0 or -errno.
+int stage1_minimise(struct stage1 *s, int max_iterations, double relative_cost, double *cost);
+// The normal equations of the mean of squares + E_sim at base, in 1/r. A, g zeroed by the caller.
+int stage1_normal_equations(struct stage1 *s, double *cost, double *A, double *g);
+// The error of `use_view` under `state`, over the texels that the views in s->p saw: others have no albedo to be judged.
+int stage1_measure(const struct stage1 *s, const struct photometric_state *state, const uint8_t *use_view,
+                   struct photometric_error *e);
+// The texel step that leaves about n_samples; odd, so as not to fall in step with the texture's rows.
+int stage1_step_for(const struct stage1 *s, int64_t n_samples);
+
+// The paper's alternation (alternating.c). fit[n_views]: 1 = fitted.
+int stage1_alternate(struct stage1 *s, const uint8_t *fit);
