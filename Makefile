@@ -32,11 +32,11 @@ endif
 
 # ---- what is built ------------------------------------------------------------------------------------------------------
 TAKE := $(addprefix solver/take/,atomic_file.c image.c image_exr.c image_hdr.c image_png.c image_tiff.c json.c log.c progress.c take.c)
-SOLVER := $(addprefix solver/,alternating.c cameras.c cameras_colmap.c compare.c csv.c disney.c joint.c lights.c lm.c mesh.c mesh_import.c \
-  normal_equations.c orientation.c panorama.c parallel.c pcg.c photometric.c rays.c render.c samples.c shapes.c stage1.c synth.c \
-  texels.c visibility.c)
+SOLVER := $(addprefix solver/,alternating.c cameras.c cameras_colmap.c compare.c csv.c disney.c joint.c levels.c lights.c lm.c materials.c mesh.c mesh_import.c \
+  normal_equations.c orientation.c panorama.c parallel.c pcg.c photometric.c rays.c regions.c render.c samples.c shapes.c stage1.c synth.c \
+  texel_fit.c texels.c visibility.c)
 KERNELS := $(addprefix solver/kernels/,kernels.c kernels_ref.c kernels_portable.c kernels_avx2.c kernels_avx512.c)
-COMMANDS := $(addprefix solver/commands/,arguments.c brdf.c compare.c inputs.c lights.c output.c render.c solve.c synth.c visibility.c)
+COMMANDS := $(addprefix solver/commands/,arguments.c brdf.c compare.c inputs.c lights.c output.c render.c solve.c solve_materials.c synth.c visibility.c)
 LIBRARY := $(TAKE) $(SOLVER) $(KERNELS)
 FUZZED := $(TAKE) $(addprefix solver/,cameras.c cameras_colmap.c csv.c lights.c mesh.c mesh_import.c orientation.c panorama.c parallel.c texels.c)
 TESTS := $(addprefix test_,brdf cameras compare csv disney image joint json judge lights lm mesh normal_equations orientation panorama parallel pcg photometric rays render samples shapes synth take texels vec3 visibility) check_kernels
@@ -131,7 +131,7 @@ stability: deps deps-bench $(BUILD)/tests/bench/stability_kernels
 	@echo "stability: build/stability/kernels.csv .svg .png: where float32 fails, over roughness and elevation"
 
 # ---- installation ---------------------------------------------------------------------------------------------------------
-MAN := $(addprefix $(BUILD)/man/rigsolve,.1 $(addprefix -,$(addsuffix .1,$(filter-out arguments inputs output,$(notdir $(COMMANDS:.c=))))))
+MAN := $(addprefix $(BUILD)/man/rigsolve,.1 $(addprefix -,$(addsuffix .1,$(filter-out arguments inputs output solve_materials,$(notdir $(COMMANDS:.c=))))))
 man: $(MAN)
 $(BUILD)/man/rigsolve.1: $(BUILD)/bin/rigsolve
 	@mkdir -p $(@D)
