@@ -33,7 +33,7 @@ endif
 # ---- what is built ------------------------------------------------------------------------------------------------------
 TAKE := $(addprefix solver/take/,atomic_file.c image.c image_exr.c image_hdr.c image_png.c image_tiff.c json.c log.c progress.c take.c)
 SOLVER := $(addprefix solver/,alternating.c cameras.c cameras_colmap.c compare.c csv.c disney.c joint.c levels.c lights.c lm.c materials.c mesh.c mesh_import.c \
-  normal_equations.c orientation.c panorama.c parallel.c pcg.c photometric.c rays.c regions.c render.c samples.c shapes.c stage1.c synth.c \
+  normal_equations.c orientation.c panorama.c parallel.c pcg.c photometric.c rays.c regions.c relocate.c render.c samples.c shapes.c stage1.c synth.c \
   texel_fit.c texels.c visibility.c)
 KERNELS := $(addprefix solver/kernels/,kernels.c kernels_ref.c kernels_portable.c kernels_avx2.c kernels_avx512.c)
 COMMANDS := $(addprefix solver/commands/,arguments.c brdf.c compare.c inputs.c lights.c output.c render.c solve.c solve_materials.c synth.c visibility.c)

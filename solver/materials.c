@@ -643,17 +643,20 @@ static int pyramid(struct estimate *e, const struct materials_input *in, struct 
     progress_begin("materials", e->levels.n);
     for (int k = 0; !err && k < e->levels.n; k++) {
         const struct level *l = &e->levels.level[k];
+        const bool solved = !e->set->most_size || l->size <= e->set->most_size;
         double *scale = NULL;
         err = spread(&theta, l, (const float(*)[DISNEY_N])parent, in->start_theta);
         if (!err)
             err = whole_weights(e, k, &scale);
         if (!err && region) {
             uint8_t *finer = malloc((size_t)l->n + 1);
-            err = finer ? regions_refine(&m->regions, finer, region, &e->scene, l, (const float(*)[3])e->albedo, e->set->n_threads) : -ENOMEM;
+            for (int i = 0; finer && !solved && i < l->n; i++)
+                finer[i] = region[l->parent[i]];
+            err = !finer ? -ENOMEM : !solved ? 0 : regions_refine(&m->regions, finer, region, &e->scene, l, (const float(*)[3])e->albedo, e->set->n_threads);
             free(region);
             region = finer;
         }
-        if (!err)
+        if (!err && solved)
             err = solve_level(e, k, theta, (const float(*)[DISNEY_N])parent, region, scale, &m->level[m->n_levels++]);
         if (!err && k == select_at) {
             region = malloc((size_t)l->n + 1);
@@ -694,7 +697,9 @@ int materials_solve(struct materials *out, const struct materials_input *in, con
     e.albedo = m.albedo;
     if (!err)
         err = pyramid(&e, in, &m);
-    if (!err) {
+    if (!err && set->most_size && set->most_size < in->texels->size) {
+        // a look on the way: nothing is judged
+    } else if (!err) {
         m.std = malloc(n * sizeof(*m.std)), m.validity = calloc(n, 1), m.coverage = calloc(n, sizeof(*m.coverage));
         err = m.std && m.validity && m.coverage ? judge(&e, &m) : -ENOMEM;
     }

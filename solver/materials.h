@@ -25,6 +25,7 @@ struct materials_settings {
     bool selection;      // model selection per region
     int cap;             // samples a coarse texel looks at, about
     int n_bounces;       // how often diffuse interreflection is gathered; 0: none
+    int most_size;       // levels finer than this are left out: texels inherit (0: none is)
     int n_threads;
 };
 struct materials_settings materials_defaults(void); // ours

@@ -2,6 +2,7 @@
 #include "solver/commands/solve_materials.h"
 
 #include "solver/commands/arguments.h"
+#include "solver/relocate.h"
 #include "solver/take/image.h"
 #include "solver/take/log.h"
 #include "solver/visibility.h"
@@ -14,7 +15,7 @@
 #include <sys/stat.h>
 #include <unistd.h>
 
-enum { KEY_STAGE = 0x20000, KEY_LIGHTS_FROM, KEY_W_REG, KEY_W_PARENT, KEY_NO_SEAMS, KEY_BOUNCES, KEY_NO_SELECTION };
+enum { KEY_STAGE = 0x20000, KEY_LIGHTS_FROM, KEY_W_REG, KEY_W_PARENT, KEY_NO_SEAMS, KEY_BOUNCES, KEY_NO_SELECTION, KEY_RELOCATE };
 
 static const struct argp_option options[] = {
     { 0, 0, 0, 0, "Materials", 4 },
@@ -24,6 +25,7 @@ static const struct argp_option options[] = {
     { "w-parent", KEY_W_PARENT, "W", 0, "weight that draws a texel towards its coarser parent (joint: .02; alternating: 0)", 4 },
     { "no-seams", KEY_NO_SEAMS, 0, 0, "charts of the atlas know nothing of each other", 4 },
     { "no-selection", KEY_NO_SELECTION, 0, 0, "every parameter is free at every texel", 4 },
+    { "relocate", KEY_RELOCATE, "N", 0, "find the lights again under the materials, at most N times (joint: 2; with --lights-from: 0)", 4 },
     { "bounces", KEY_BOUNCES, "N", 0, "gather diffuse interreflection N times (0)", 4 },
     { 0 },
 };
@@ -35,6 +37,7 @@ static error_t parse(int key, char *text, struct argp_state *state)
     case ARGP_KEY_INIT:
         s->last_stage = 2;
         s->w_reg = s->w_parent = -1;
+        s->n_relocations = -1;
         return 0;
     case KEY_STAGE:
         s->last_stage = (int)argument_integer(state, "--stage", text, 1, 2);
@@ -53,6 +56,9 @@ static error_t parse(int key, char *text, struct argp_state *state)
         return 0;
     case KEY_NO_SELECTION:
         s->no_selection = true;
+        return 0;
+    case KEY_RELOCATE:
+        s->n_relocations = (int)argument_integer(state, "--relocate", text, 0, 10);
         return 0;
     case KEY_BOUNCES:
         s->n_bounces = (int)argument_integer(state, "--bounces", text, 0, 10);
@@ -178,10 +184,13 @@ int solve_read_lights(struct joint_result *out, struct lights *lights, const str
 
 // ---- the stage ----------------------------------------------------------------------------------------------------------
 
-int solve_find_materials(struct materials *out, const struct solve_materials *set, const struct joint_result *stage1, enum method method,
-                         const struct inputs *in, const struct samples *samples, const uint8_t *held_out, int n_threads)
+int solve_find_materials(struct materials *out, const struct solve_materials *set, struct joint_result *stage1, int n_groups,
+                         const struct joint_settings *joint, const struct inputs *in, const struct samples *samples, const uint8_t *held_out,
+                         int n_threads)
 {
     struct light_visibility visibility = { 0 };
+    const enum method method = joint->method;
+    const int n_relocations = set->n_relocations >= 0 ? set->n_relocations : set->lights_from || method != METHOD_JOINT ? 0 : 2;
     struct materials_settings settings = method == METHOD_JOINT ? materials_defaults() : materials_paper();
     struct materials_input input = { .texels = &in->texels, .samples = samples, .lights = &stage1->state.lights, .hold_out = held_out,
                                      .log_gain = stage1->state.log_gain, .rays = in->rays, .mesh = &in->mesh,
@@ -200,6 +209,24 @@ int solve_find_materials(struct materials *out, const struct solve_materials *se
         err = light_visibility_trace(&visibility, in->rays, &in->texels, &stage1->state.lights, NULL, 1, 1, n_threads);
         input.visible = visibility.bits, input.words_per_texel = visibility.words_per_texel;
     }
+    for (int round = 0; !err && round < n_relocations; round++) {
+        struct materials look = { 0 };
+        double before, after;
+        settings.most_size = 64;
+        err = materials_solve(&look, &input, &settings);
+        if (!err)
+            err = relocate_lights(&stage1->state, &in->texels, samples, in->rays, n_groups, held_out, (const float(*)[DISNEY_N])look.theta, joint,
+                                  &before, &after);
+        materials_free(&look);
+        if (!err && visibility.bits)
+            err = light_visibility_refresh(&visibility, in->rays, &in->texels, &stage1->state.lights, NULL, .5 * M_PI / 180, 1, n_threads);
+        if (err > 0)
+            err = 0; // so many lights were traced again
+        log_debug("materials: lights again: views aside %.3f -> %.3f %%", before, after);
+        if (!err && after > .97 * before)
+            break;
+    }
+    settings.most_size = 0;
     if (!err)
         err = materials_solve(out, &input, &settings);
     light_visibility_free(&visibility);
