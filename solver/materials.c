@@ -660,7 +660,7 @@ static int pyramid(struct estimate *e, const struct materials_input *in, struct 
             err = solve_level(e, k, theta, (const float(*)[DISNEY_N])parent, region, scale, &m->level[m->n_levels++]);
         if (!err && k == select_at) {
             region = malloc((size_t)l->n + 1);
-            err = region ? regions_find(&m->regions, region, &e->scene, l, (const float(*)[DISNEY_N])theta, e->albedo, in->start_theta, e->set->n_threads) : -ENOMEM;
+            err = region ? regions_find(&m->regions, region, &e->scene, l, (const float(*)[DISNEY_N])theta, e->albedo, e->set->n_threads) : -ENOMEM;
             e->regions = &m->regions;
             if (!err) // the same level again, with what was chosen
                 err = solve_level(e, k, theta, (const float(*)[DISNEY_N])parent, region, scale, &m->level[m->n_levels++]);

@@ -22,9 +22,14 @@ enum {
 static const double least_share = .01;       // a smaller region is dissolved
 static const double worth_a_region = 1.10;   // mean squared error of views set aside, of one reflectance for two regions
 static const double worth_a_parameter = .97; // the same with a parameter free per texel
-static const double most_free_std = .15, most_tied_std = .3;
+static const double worth_a_layer = 1.01;    // the same without clearcoat, sheen, ...
+static const double rounding2 = 3e-4 * 3e-4; // what half floats and look-ups leave in any comparison: to gain less is to gain nothing
+static const double most_free_std = .15;
 static const double hold = 1e-3;             // draws what nothing determines towards where it started, beside the sum of squares
 static const double own_hold = .02;          // the same of one texel's own parameter
+
+// What a parameter is when nothing speaks for it.
+static const float plain[DISNEY_N] = { [DISNEY_SPECULAR] = .5f, [DISNEY_ROUGHNESS] = .5f, [DISNEY_CLEARCOAT_GLOSS] = .5f };
 
 struct search {
     const struct texel_scene *scene;
@@ -80,7 +85,7 @@ struct shared_fit {
     struct search *s;
     const struct texel_scene *scene;
     const struct witnesses *w;
-    const double *start;
+    uint16_t frozen;         // parameters that stay plain
     float theta[DISNEY_N];
 };
 
@@ -107,7 +112,7 @@ static int shared_equations(void *arg, const double *x, double *cost, double *A,
     const int err = parallel_sum(f->s->n_threads, f->w->n, 4, add_witnesses, f, 1 + DISNEY_N + THETA_PACKED, sums);
     *cost = sums[0];
     for (int p = 0; p < DISNEY_N; p++) {
-        const double d = x[p] - f->start[p];
+        const double d = x[p] - (double)plain[p];
         *cost += .5 * hold * d * d;
         if (!A)
             continue;
@@ -123,24 +128,53 @@ static int shared_cost(void *arg, const double *x, double *cost)
     return shared_equations(arg, x, cost, NULL, NULL);
 }
 
-static int fit_shared(struct search *s, const struct texel_scene *scene, const struct witnesses *w, const double start[DISNEY_N],
-                      float theta[DISNEY_N])
+static int fit_from(struct shared_fit *f, const float start[DISNEY_N], int most_iterations, float theta[DISNEY_N], double *cost)
 {
     static const double lower[DISNEY_N] = { 0 }, upper[DISNEY_N] = { 1, 1, 1, 1, 1, 1, 1, 1, 1, 1 };
-    struct shared_fit f = { .s = s, .scene = scene, .w = w, .start = start };
-    const struct lm_problem problem = { .n = DISNEY_N, .lower = lower, .upper = upper, .cost = shared_cost,
-                                        .normal_equations = shared_equations, .arg = &f };
+    double low[DISNEY_N], high[DISNEY_N], x[DISNEY_N];
+    const struct lm_problem problem = { .n = DISNEY_N, .lower = low, .upper = high, .cost = shared_cost,
+                                        .normal_equations = shared_equations, .arg = f };
     struct lm_settings set = lm_defaults();
-    struct lm_result result;
-    double x[DISNEY_N];
-    set.max_iterations = 30, set.relative_cost = 1e-5;
-    for (int p = 0; p < DISNEY_N; p++)
-        x[p] = fmin(fmax((double)theta[p], .02), .98);
-    if (!w->n)
-        return 0;
+    struct lm_result result = { 0 };
+    set.max_iterations = most_iterations, set.relative_cost = 1e-5;
+    for (int p = 0; p < DISNEY_N; p++) {
+        const bool frozen = f->frozen >> p & 1;
+        x[p] = frozen ? (double)plain[p] : fmin(fmax((double)start[p], .02), .98); // at a bound nothing moves
+        low[p] = frozen ? x[p] : lower[p], high[p] = frozen ? x[p] : upper[p];
+    }
     const int err = lm_minimise(&problem, &set, x, &result);
+    *cost = result.cost;
     for (int p = 0; p < DISNEY_N && !err; p++)
         theta[p] = (float)x[p];
+    return err;
+}
+
+// theta: a guess in. Highlights have many wrong explanations, so from a few places: the guess, dielectrics and metals, dull and sharp.
+static int fit_shared(struct search *s, const struct texel_scene *scene, const struct witnesses *w, uint16_t frozen, bool anywhere,
+                      float theta[DISNEY_N])
+{
+    static const float starts[][2] = { { 0, .15f }, { 0, .35f }, { 0, .7f }, { 1, .2f }, { 1, .45f } }; // metallic, roughness
+    struct shared_fit f = { .s = s, .scene = scene, .w = w, .frozen = frozen };
+    float best[DISNEY_N];
+    double least;
+    if (!w->n)
+        return 0;
+    int err = fit_from(&f, theta, anywhere ? 8 : 30, best, &least);
+    for (size_t k = 0; !err && anywhere && k < sizeof(starts) / sizeof(*starts); k++) {
+        float from[DISNEY_N], to[DISNEY_N];
+        double cost;
+        memcpy(from, plain, sizeof(from));
+        from[DISNEY_METALLIC] = starts[k][0], from[DISNEY_ROUGHNESS] = starts[k][1];
+        err = fit_from(&f, from, 8, to, &cost);
+        if (!err && cost < least) {
+            least = cost;
+            memcpy(best, to, sizeof(best));
+        }
+    }
+    if (!err && anywhere)
+        err = fit_from(&f, best, 30, best, &least);
+    if (!err)
+        memcpy(theta, best, sizeof(best));
     return err;
 }
 
@@ -350,13 +384,13 @@ static void drop(struct search *s, int r)
     }
 }
 
-static int fit_all(struct search *s, const double start[DISNEY_N])
+static int fit_all(struct search *s, bool anywhere)
 {
     int err = 0;
     for (int r = 0; !err && r < s->out->n; r++) {
         struct witnesses w;
         call_witnesses(s, 1u << r, &w);
-        err = fit_shared(s, &s->inner, &w, start, s->out->region[r].theta);
+        err = fit_shared(s, &s->inner, &w, 0, anywhere, s->out->region[r].theta);
     }
     return err;
 }
@@ -478,7 +512,7 @@ static int dissolve_small(struct search *s)
 }
 
 // As long as two regions do as well under one reflectance, they are one.
-static int merge(struct search *s, const double start[DISNEY_N])
+static int merge(struct search *s)
 {
     int err = 0;
     while (!err && s->out->n > 1) {
@@ -501,12 +535,12 @@ static int merge(struct search *s, const double start[DISNEY_N])
                     both.texel[both.n++] = w[b].texel[(int64_t)k * w[b].n / (w[b].n < WITNESSES / 2 ? w[b].n : WITNESSES / 2)];
                 for (int p = 0; p < DISNEY_N; p++)
                     theta[p] = .5f * (s->out->region[a].theta[p] + s->out->region[b].theta[p]);
-                err = fit_shared(s, &s->inner, &both, start, theta);
+                err = fit_shared(s, &s->inner, &both, 0, false, theta);
                 if (!err)
                     err = test(s, &w[a], theta, 0, -1, &error_a, NULL);
                 if (!err)
                     err = test(s, &w[b], theta, 0, -1, &error_b, NULL);
-                const double ratio = fmax(error_a / fmax(alone[a], 1e-12), error_b / fmax(alone[b], 1e-12));
+                const double ratio = fmax(error_a / (alone[a] + rounding2), error_b / (alone[b] + rounding2));
                 if (!err && ratio < least) {
                     least = ratio, best_a = a, best_b = b;
                     memcpy(best_theta, theta, sizeof(theta));
@@ -518,7 +552,7 @@ static int merge(struct search *s, const double start[DISNEY_N])
         rename_region(s, best_b, best_a);
         memcpy(s->out->region[best_a].theta, best_theta, sizeof(best_theta));
         drop(s, best_b);
-        err = fit_all(s, start);
+        err = fit_all(s, false);
         if (!err)
             err = deal_out(s);
         if (!err)
@@ -531,7 +565,7 @@ static int merge(struct search *s, const double start[DISNEY_N])
 
 // Covariance of a region's theta, albedos eliminated: A^-1 B A^-1 with B the sum of squared scores by view and by patch of the surface:
 // what the model lacks goes together there, and noise does not know it.
-static int region_uncertainty(struct search *s, const struct witnesses *w, struct region *r)
+static int region_uncertainty(struct search *s, const struct witnesses *w, uint16_t frozen, struct region *r)
 {
     double A[THETA_PACKED] = { 0 }, B[THETA_PACKED] = { 0 }, C[DISNEY_N][DISNEY_N] = { { 0 } };
     const int n_views = s->scene->samples->n_views;
@@ -572,6 +606,8 @@ static int region_uncertainty(struct search *s, const struct witnesses *w, struc
     for (int p = 0; !err && p < DISNEY_N; p++) {
         A[packed_at(p, p)] += hold;
         for (int q = 0; q <= p; q++) {
+            if ((frozen >> p & 1) || (frozen >> q & 1))
+                continue;
             for (int v = 0; v < n_views; v++)
                 B[packed_at(p, q)] += by_view[v][p] * by_view[v][q];
             for (int v = 0; v < PATCHES; v++)
@@ -583,6 +619,9 @@ static int region_uncertainty(struct search *s, const struct witnesses *w, struc
     free(J);
     if (err)
         return err;
+    for (int p = 0; p < DISNEY_N; p++)
+        for (int q = 0; q < DISNEY_N && (frozen >> p & 1); q++)
+            A[packed_at(p, q)] = p == q;
     double inverse[DISNEY_N][DISNEY_N] = { { 0 } };
     const bool regular = packed_factor(DISNEY_N, A);
     for (int p = 0; regular && p < DISNEY_N; p++) {
@@ -595,54 +634,71 @@ static int region_uncertainty(struct search *s, const struct witnesses *w, struc
                 for (int b = 0; b < DISNEY_N; b++)
                     C[p][q] += inverse[p][a] * B[packed_at(a, b)] * inverse[b][q];
     for (int p = 0; p < DISNEY_N; p++) {
-        // no wider than knowing nothing of a number in [0,1], and that where the data say nothing
-        const double known = regular ? 1 - hold * inverse[p][p] : 0;
-        const double variance = C[p][p] + (1 - known) / 12;
-        r->std[p] = (float)sqrt(fmin(variance, 1. / 12));
+        // what the data do not say, or say no better than that it is a number in [0,1], has no standard deviation
+        const double said = regular && !(frozen >> p & 1) ? 1 - hold * inverse[p][p] : 0;
+        r->std[p] = said > .5 && C[p][p] < 1. / 12 ? (float)sqrt(C[p][p]) : INFINITY;
         for (int q = 0; q <= p; q++)
             r->covariance[packed_at(p, q)] = C[p][q];
     }
     return 0;
 }
 
-static int choose_freedom(struct search *s, struct region *r, int at, const float whole[DISNEY_N], const double start[DISNEY_N])
+// Does the region do without? What none of the views set aside misses stays plain.
+static int simplify(struct search *s, const struct witnesses *w, struct region *r, int at, uint16_t *frozen, double *error2)
 {
-    struct witnesses w;
-    double error2, std;
-    uint16_t free_mask = 0;
+    static const uint16_t without[] = {
+        1 << DISNEY_CLEARCOAT | 1 << DISNEY_CLEARCOAT_GLOSS, 1 << DISNEY_SHEEN | 1 << DISNEY_SHEEN_TINT, 1 << DISNEY_ANISOTROPIC,
+        1 << DISNEY_SPECULAR_TINT, 1 << DISNEY_SUBSURFACE, 1 << DISNEY_METALLIC,
+    };
+    int err = test(s, w, r->theta, 0, -1, error2, NULL);
+    for (size_t k = 0; !err && k < sizeof(without) / sizeof(*without); k++) {
+        float theta[DISNEY_N];
+        double error;
+        memcpy(theta, r->theta, sizeof(theta));
+        err = fit_shared(s, &s->inner, w, *frozen | without[k], false, theta);
+        if (!err)
+            err = test(s, w, theta, 0, -1, &error, NULL);
+        log_debug("regions: region %d without %s: views aside %.4f -> %.4f %%", at, disney_parameter_names[__builtin_ctz(without[k])],
+                  100 * sqrt(*error2), 100 * sqrt(error));
+        if (!err && error < worth_a_layer * *error2 + rounding2) {
+            *frozen |= without[k];
+            *error2 = error;
+            memcpy(r->theta, theta, sizeof(theta));
+        }
+    }
+    return err;
+}
+
+static int choose_freedom(struct search *s, struct region *r, int at)
+{
     // By what a texel can tell, best first (SOLVER.md 4); the rest belongs to regions.
     static const int candidates[] = { DISNEY_ROUGHNESS, DISNEY_METALLIC, DISNEY_SPECULAR, DISNEY_SUBSURFACE };
+    struct witnesses w;
+    double error2 = 0, std;
+    uint16_t free_mask = 0, frozen = 0;
     call_witnesses(s, 1u << at, &w);
-    int err = fit_shared(s, &s->inner, &w, start, r->theta);
+    int err = fit_shared(s, &s->inner, &w, 0, false, r->theta);
     if (!err)
-        err = test(s, &w, r->theta, 0, -1, &error2, NULL);
+        err = simplify(s, &w, r, at, &frozen, &error2);
     for (int p = 0; p < DISNEY_N; p++)
-        r->freedom[p] = PARAMETER_TIED;
+        r->freedom[p] = frozen >> p & 1 ? PARAMETER_FROZEN : PARAMETER_TIED;
     for (size_t k = 0; !err && k < sizeof(candidates) / sizeof(*candidates); k++) {
         double with;
         const uint16_t tried = (uint16_t)(free_mask | 1 << candidates[k]);
+        if (frozen >> candidates[k] & 1)
+            continue;
         err = test(s, &w, r->theta, tried, candidates[k], &with, &std);
         log_debug("regions: region %d, %s free per texel: views aside %.4f -> %.4f %%, std %.3f", at, disney_parameter_names[candidates[k]],
                   100 * sqrt(error2), 100 * sqrt(with), std);
-        if (!err && std < most_free_std && with < worth_a_parameter * error2) {
+        if (!err && std < most_free_std && with + rounding2 < worth_a_parameter * error2) {
             free_mask = tried, error2 = with;
             r->freedom[candidates[k]] = PARAMETER_FREE;
         }
     }
     r->aside_rmse_percent = 100 * sqrt(error2);
     if (!err)
-        err = fit_shared(s, s->scene, &w, start, r->theta);
-    if (!err)
-        err = region_uncertainty(s, &w, r);
-    bool any = false;
-    for (int p = 0; !err && p < DISNEY_N; p++)
-        if (r->freedom[p] == PARAMETER_TIED && r->std[p] > most_tied_std - 1e-6) {
-            r->freedom[p] = PARAMETER_FROZEN;
-            any = true;
-        }
-    (void)any;
-    (void)whole;
-    return err;
+        err = fit_shared(s, s->scene, &w, frozen, false, r->theta);
+    return err ? err : region_uncertainty(s, &w, frozen, r);
 }
 
 // ---- the whole ----------------------------------------------------------------------------------------------------------
@@ -688,30 +744,26 @@ static int search_new(struct search *s, const struct texel_scene *scene, const s
 }
 
 int regions_find(struct regions *out, uint8_t *region_of, const struct texel_scene *scene, const struct level *level,
-                 const float (*theta)[DISNEY_N], float (*albedo)[3], const double start_theta[DISNEY_N], int n_threads)
+                 const float (*theta)[DISNEY_N], float (*albedo)[3], int n_threads)
 {
     struct search s = { .albedo = albedo, .n_threads = n_threads, .region = region_of, .out = out };
-    float whole[DISNEY_N];
-    double start[DISNEY_N];
     memset(out, 0, sizeof(*out));
     int err = search_new(&s, scene, level);
-    for (int p = 0; p < DISNEY_N; p++) // of the coarsest texel, as it was found
-        start[p] = start_theta[p], whole[p] = (float)start_theta[p];
     if (!err)
         err = cut(&s, theta);
     if (!err)
-        err = fit_all(&s, start);
+        err = fit_all(&s, true);
     for (int round = 0; !err && round < DEAL_ROUNDS; round++) {
         err = deal_out(&s);
         if (!err)
             err = dissolve_small(&s);
         if (!err)
-            err = fit_all(&s, start);
+            err = fit_all(&s, true);
     }
     if (!err)
-        err = merge(&s, start);
+        err = merge(&s);
     for (int r = 0; !err && r < out->n; r++)
-        err = choose_freedom(&s, &out->region[r], r, whole, start);
+        err = choose_freedom(&s, &out->region[r], r);
     if (!err)
         count(&s);
     search_free(&s);

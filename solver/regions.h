@@ -2,8 +2,8 @@
 //
 // "Model no more than the scene needs": texels are dealt out to a few shared reflectances, each to the one that explains its samples
 // best (albedo eliminated); regions that do as well under one reflectance become one. Then a parameter is set free per texel only where its
-// posterior standard deviation is below .15 and views set aside are explained better; what the region as a whole does not determine
-// is frozen at the value of the whole object.
+// posterior standard deviation is below .15 and views set aside are explained better; and what the region can do without (clearcoat, sheen,
+// anisotropy, ...: views set aside are explained as well) is frozen at its plain value, 0.
 #pragma once
 #include "solver/levels.h"
 #include "solver/texel_fit.h"
@@ -14,7 +14,7 @@ extern const char *const parameter_freedom_names[3]; // "frozen", "tied", "free"
 
 struct region {
     float theta[DISNEY_N];        // of all its texels; of a free parameter: where texels begin
-    float std[DISNEY_N];          // of theta as the region's: noise, and what the model lacks, by view (regions.c)
+    float std[DISNEY_N];          // of theta as the region's: noise, and what the model lacks (regions.c); infinite: the pictures do not say, or frozen
     double covariance[THETA_PACKED];
     enum parameter_freedom freedom[DISNEY_N];
     int n_texels;
@@ -28,7 +28,7 @@ struct regions {
 // level: the one whose texels are dealt out, with theta[level n] and the albedo of its delegates (albedo[texels n], refined).
 // region_of[level n] out. use_view of the scene: those that may be fitted. 0 or -ENOMEM.
 int regions_find(struct regions *out, uint8_t *region_of, const struct texel_scene *scene, const struct level *level,
-                 const float (*theta)[DISNEY_N], float (*albedo)[3], const double start_theta[DISNEY_N], int n_threads);
+                 const float (*theta)[DISNEY_N], float (*albedo)[3], int n_threads);
 
 // A finer level inherits; texels at borders choose again between their neighbours' regions.
 int regions_refine(const struct regions *r, uint8_t *region_of, const uint8_t *parent_region_of, const struct texel_scene *scene,
