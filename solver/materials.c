@@ -592,6 +592,22 @@ static void doubt_texels(void *arg, int64_t begin, int64_t end, int worker, doub
         m->validity[t] = !(own2 > 1e-6) ? MATERIAL_UNOBSERVED : n_rows < 3 * WEAK_SAMPLES ? MATERIAL_WEAK : MATERIAL_VALID;
         const double shared = 24; // so many rows' worth of the scene's own residual
         const double error2 = (squares + shared * j->error2) / fmax(n_rows + shared - n, 12);
+        // what the region's theta leaves open of the albedo: d albedo = -own^-1 mixed d theta
+        double own[6] = { 0 }, mixed[DISNEY_N][3], of_region[3] = { 0 };
+        for (int a = 0; r && a < 3; a++) {
+            for (int b = 0; b <= a; b++)
+                own[packed_at(a, b)] = A[packed_at(DISNEY_N + a, DISNEY_N + b)] + (a == b ? 1e-12 : 0);
+            for (int p = 0; p < DISNEY_N; p++)
+                mixed[p][a] = r->freedom[p] == PARAMETER_TIED ? A[packed_at(DISNEY_N + a, p)] : 0;
+        }
+        if (r && packed_factor(3, own)) {
+            for (int p = 0; p < DISNEY_N; p++)
+                packed_solve(3, own, mixed[p]);
+            for (int a = 0; a < 3; a++)
+                for (int p = 0; p < DISNEY_N; p++)
+                    for (int q = 0; q < DISNEY_N; q++)
+                        of_region[a] += mixed[p][a] * r->covariance[packed_at(p, q)] * mixed[q][a];
+        }
         bool is_free[DISNEY_N + 3];
         for (int p = 0; p < n; p++) {
             is_free[p] = p >= DISNEY_N || !r || r->freedom[p] == PARAMETER_FREE;
@@ -612,7 +628,7 @@ static void doubt_texels(void *arg, int64_t begin, int64_t end, int worker, doub
             double x[DISNEY_N + 3] = { 0 };
             x[p] = 1;
             packed_solve(n, A, x);
-            m->std[t][p] = is_free[p] ? (float)sqrt(error2 * x[p]) : r->std[p];
+            m->std[t][p] = is_free[p] ? (float)sqrt(error2 * x[p] + (p < DISNEY_N ? 0 : of_region[p - DISNEY_N])) : r->std[p];
         }
     }
 }
@@ -630,6 +646,21 @@ static int judge(struct estimate *e, struct materials *m)
     if (!err)
         err = parallel_sum(e->set->n_threads, m->n_texels, EVALUATE_CHUNK, doubt_texels, &j, 1, sums);
     return err ? err : fill_unobserved(e, m);
+}
+
+// Of each region; without regions, of texels here and there.
+static void check_energy(const struct estimate *e, struct materials *m)
+{
+    enum { LOOKS = 96 };
+    for (int k = 0; k < LOOKS && k < m->n_texels; k++) {
+        const int t = (int)((int64_t)k * m->n_texels / (m->n_texels < LOOKS ? m->n_texels : LOOKS));
+        if (m->validity[t] != MATERIAL_VALID)
+            continue;
+        m->most_directional_albedo = fmax(m->most_directional_albedo, materials_directional_albedo(m->theta[t], m->albedo[t], e->set->variant));
+    }
+    if (m->most_directional_albedo > 1.02)
+        log_warning("materials: a texel sends back %.2f times the light that it gets: such a material makes light; is the panorama's scale that of the views?",
+                    m->most_directional_albedo);
 }
 
 static int pyramid(struct estimate *e, const struct materials_input *in, struct materials *m)
@@ -702,6 +733,8 @@ int materials_solve(struct materials *out, const struct materials_input *in, con
     } else if (!err) {
         m.std = malloc(n * sizeof(*m.std)), m.validity = calloc(n, 1), m.coverage = calloc(n, sizeof(*m.coverage));
         err = m.std && m.validity && m.coverage ? judge(&e, &m) : -ENOMEM;
+        if (!err)
+            check_energy(&e, &m);
     }
     estimate_free(&e);
     if (err)
@@ -726,7 +759,7 @@ void materials_free(struct materials *m)
 
 double materials_directional_albedo(const float theta[DISNEY_N], const float albedo[3], enum disney_variant variant)
 {
-    enum { RINGS = 48, SECTORS = 64 };
+    enum { RINGS = 40, SECTORS = 32 };
     struct disney m = { .variant = variant };
     const struct disney_frame frame = { { 0, 0, 1 }, { 1, 0, 0 }, { 0, 1, 0 } };
     double most = 0;
@@ -735,21 +768,24 @@ double materials_directional_albedo(const float theta[DISNEY_N], const float alb
     for (int c = 0; c < 3; c++)
         m.albedo[c] = (double)albedo[c];
     for (int k = 0; k < 4; k++) {
-        const double tilt = k * .35;
-        const double v[3] = { sin(tilt), 0, cos(tilt) };
-        double sum[3] = { 0 };
+        const double tilt = .35 * k, v[3] = { sin(tilt), 0, cos(tilt) };
+        double sum[3] = { 0 }, total = 0;
+        // rings about the mirror direction (-vx, -vy, vz), dense near it: cos(angle) = 1 - 2 u^4
         for (int i = 0; i < RINGS; i++)
             for (int j = 0; j < SECTORS; j++) {
-                // equal shares of projected solid angle: each pi / (RINGS SECTORS)
-                const double s2 = (i + .5) / RINGS, phi = 2 * M_PI * (j + .5) / SECTORS, s = sqrt(s2);
-                const double l[3] = { s * cos(phi), s * sin(phi), sqrt(1 - s2) };
+                const double u = (i + .5) / RINGS, phi = 2 * M_PI * (j + .5) / SECTORS, z = 1 - 2 * u * u * u * u, s = sqrt(fmax(1 - z * z, 0));
+                const double omega = 8 * u * u * u / RINGS * 2 * M_PI / SECTORS, x = s * cos(phi), y = s * sin(phi);
+                const double l[3] = { x * v[2] - z * v[0], y, x * v[0] + z * v[2] };
                 double f[3];
+                if (l[2] <= 0)
+                    continue;
+                total += omega * l[2];
                 disney_eval(&m, &frame, l, v, f);
                 for (int c = 0; c < 3; c++)
-                    sum[c] += f[c] * M_PI / (RINGS * SECTORS);
+                    sum[c] += f[c] * l[2] * omega;
             }
         for (int c = 0; c < 3; c++)
-            most = fmax(most, sum[c]);
+            most = fmax(most, sum[c] * M_PI / total);
     }
     return most;
 }

@@ -23,6 +23,7 @@ static const double least_share = .01;       // a smaller region is dissolved
 static const double worth_a_region = 1.10;   // mean squared error of views set aside, of one reflectance for two regions
 static const double worth_a_parameter = .97; // the same with a parameter free per texel
 static const double worth_a_layer = 1.01;    // the same without clearcoat, sheen, ...
+static const double better_without = .99;
 static const double rounding2 = 3e-4 * 3e-4; // what half floats and look-ups leave in any comparison: to gain less is to gain nothing
 static const double most_free_std = .15;
 static const double hold = 1e-3;             // draws what nothing determines towards where it started, beside the sum of squares
@@ -128,7 +129,8 @@ static int shared_cost(void *arg, const double *x, double *cost)
     return shared_equations(arg, x, cost, NULL, NULL);
 }
 
-static int fit_from(struct shared_fit *f, const float start[DISNEY_N], int most_iterations, float theta[DISNEY_N], double *cost)
+static int fit_from(struct shared_fit *f, const float start[DISNEY_N], int most_iterations, double relative_cost,
+                    float theta[DISNEY_N], double *cost)
 {
     static const double lower[DISNEY_N] = { 0 }, upper[DISNEY_N] = { 1, 1, 1, 1, 1, 1, 1, 1, 1, 1 };
     double low[DISNEY_N], high[DISNEY_N], x[DISNEY_N];
@@ -136,7 +138,7 @@ static int fit_from(struct shared_fit *f, const float start[DISNEY_N], int most_
                                         .normal_equations = shared_equations, .arg = f };
     struct lm_settings set = lm_defaults();
     struct lm_result result = { 0 };
-    set.max_iterations = most_iterations, set.relative_cost = 1e-5;
+    set.max_iterations = most_iterations, set.relative_cost = relative_cost;
     for (int p = 0; p < DISNEY_N; p++) {
         const bool frozen = f->frozen >> p & 1;
         x[p] = frozen ? (double)plain[p] : fmin(fmax((double)start[p], .02), .98); // at a bound nothing moves
@@ -159,20 +161,20 @@ static int fit_shared(struct search *s, const struct texel_scene *scene, const s
     double least;
     if (!w->n)
         return 0;
-    int err = fit_from(&f, theta, anywhere ? 8 : 30, best, &least);
+    int err = fit_from(&f, theta, anywhere ? 8 : 30, 1e-5, best, &least);
     for (size_t k = 0; !err && anywhere && k < sizeof(starts) / sizeof(*starts); k++) {
         float from[DISNEY_N], to[DISNEY_N];
         double cost;
         memcpy(from, plain, sizeof(from));
         from[DISNEY_METALLIC] = starts[k][0], from[DISNEY_ROUGHNESS] = starts[k][1];
-        err = fit_from(&f, from, 8, to, &cost);
+        err = fit_from(&f, from, 8, 1e-3, to, &cost);
         if (!err && cost < least) {
             least = cost;
             memcpy(best, to, sizeof(best));
         }
     }
     if (!err && anywhere)
-        err = fit_from(&f, best, 30, best, &least);
+        err = fit_from(&f, best, 30, 1e-5, best, &least);
     if (!err)
         memcpy(theta, best, sizeof(best));
     return err;
@@ -619,9 +621,11 @@ static int region_uncertainty(struct search *s, const struct witnesses *w, uint1
     free(J);
     if (err)
         return err;
-    for (int p = 0; p < DISNEY_N; p++)
+    for (int p = 0; p < DISNEY_N; p++) {
         for (int q = 0; q < DISNEY_N && (frozen >> p & 1); q++)
             A[packed_at(p, q)] = p == q;
+        B[packed_at(p, p)] += frozen >> p & 1 ? 0 : .25 * hold * hold; // `hold` draws from a truth that is some .5 away
+    }
     double inverse[DISNEY_N][DISNEY_N] = { { 0 } };
     const bool regular = packed_factor(DISNEY_N, A);
     for (int p = 0; regular && p < DISNEY_N; p++) {
@@ -643,27 +647,33 @@ static int region_uncertainty(struct search *s, const struct witnesses *w, uint1
     return 0;
 }
 
-// Does the region do without? What none of the views set aside misses stays plain.
+// Does the region do without? What views set aside are better off without, or neither miss nor tell from plain by two standard deviations,
+// stays plain. Metal first: a little of it passes for anything.
 static int simplify(struct search *s, const struct witnesses *w, struct region *r, int at, uint16_t *frozen, double *error2)
 {
     static const uint16_t without[] = {
-        1 << DISNEY_CLEARCOAT | 1 << DISNEY_CLEARCOAT_GLOSS, 1 << DISNEY_SHEEN | 1 << DISNEY_SHEEN_TINT, 1 << DISNEY_ANISOTROPIC,
-        1 << DISNEY_SPECULAR_TINT, 1 << DISNEY_SUBSURFACE, 1 << DISNEY_METALLIC,
+        1 << DISNEY_METALLIC, 1 << DISNEY_CLEARCOAT | 1 << DISNEY_CLEARCOAT_GLOSS, 1 << DISNEY_SUBSURFACE, 1 << DISNEY_SHEEN | 1 << DISNEY_SHEEN_TINT,
+        1 << DISNEY_ANISOTROPIC, 1 << DISNEY_SPECULAR_TINT,
     };
     int err = test(s, w, r->theta, 0, -1, error2, NULL);
     for (size_t k = 0; !err && k < sizeof(without) / sizeof(*without); k++) {
-        float theta[DISNEY_N];
+        struct region simpler = *r;
+        const int p = __builtin_ctz(without[k]); // the layer's amount; the other says how it looks
         double error;
-        memcpy(theta, r->theta, sizeof(theta));
-        err = fit_shared(s, &s->inner, w, *frozen | without[k], false, theta);
+        err = region_uncertainty(s, w, *frozen, r);
         if (!err)
-            err = test(s, w, theta, 0, -1, &error, NULL);
-        log_debug("regions: region %d without %s: views aside %.4f -> %.4f %%", at, disney_parameter_names[__builtin_ctz(without[k])],
-                  100 * sqrt(*error2), 100 * sqrt(error));
-        if (!err && error < worth_a_layer * *error2 + rounding2) {
+            err = fit_shared(s, &s->inner, w, *frozen | without[k], false, simpler.theta);
+        if (!err)
+            err = test(s, w, simpler.theta, 0, -1, &error, NULL);
+        if (err)
+            break;
+        const bool plain_enough = !((double)(r->theta[p] - plain[p]) > 2 * (double)r->std[p]);
+        log_debug("regions: region %d without %s (%.3f +- %.3f): views aside %.4f -> %.4f %%", at, disney_parameter_names[p], (double)r->theta[p],
+                  (double)r->std[p], 100 * sqrt(*error2), 100 * sqrt(error));
+        if (error < better_without * *error2 || (plain_enough && error < worth_a_layer * *error2 + rounding2)) {
             *frozen |= without[k];
             *error2 = error;
-            memcpy(r->theta, theta, sizeof(theta));
+            memcpy(r->theta, simpler.theta, sizeof(r->theta));
         }
     }
     return err;
@@ -696,8 +706,10 @@ static int choose_freedom(struct search *s, struct region *r, int at)
         }
     }
     r->aside_rmse_percent = 100 * sqrt(error2);
-    if (!err)
-        err = fit_shared(s, s->scene, &w, frozen, false, r->theta);
+    struct shared_fit last = { .s = s, .scene = s->scene, .w = &w, .frozen = frozen };
+    double cost;
+    if (!err && w.n) // to the end: clearcoat against sheen is a long valley
+        err = fit_from(&last, r->theta, 100, 1e-8, r->theta, &cost);
     return err ? err : region_uncertainty(s, &w, frozen, r);
 }
 
