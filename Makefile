@@ -39,7 +39,7 @@ KERNELS := $(addprefix solver/kernels/,kernels.c kernels_ref.c kernels_portable.
 COMMANDS := $(addprefix solver/commands/,arguments.c brdf.c compare.c inputs.c lights.c output.c render.c solve.c solve_materials.c synth.c visibility.c)
 LIBRARY := $(TAKE) $(SOLVER) $(KERNELS)
 FUZZED := $(TAKE) $(addprefix solver/,cameras.c cameras_colmap.c csv.c lights.c mesh.c mesh_import.c orientation.c panorama.c parallel.c texels.c)
-TESTS := $(addprefix test_,brdf cameras compare csv disney image joint json judge lights lm mesh normal_equations orientation panorama parallel pcg photometric rays render samples shapes synth take texels vec3 visibility) check_kernels
+TESTS := $(addprefix test_,brdf cameras compare csv disney image joint json judge levels lights lm materials mesh normal_equations orientation panorama parallel pcg photometric rays render samples shapes synth take texels vec3 visibility) check_kernels
 FUZZERS := cameras csv exr hdr json lights mesh
 
 # ---- rules --------------------------------------------------------------------------------------------------------------

@@ -370,7 +370,7 @@ static int solve_tile(struct tile *t, int most_iterations, struct materials_leve
         level->n_shaded += (int64_t)sums[3];
         if (iteration + 1 > level->n_iterations)
             level->n_iterations = iteration + 1;
-        if (sums[4] < 1e-3 * sums[0])
+        if (sums[4] < (t->finest ? 1e-3 : 5e-3) * sums[0])
             break;
     }
     if (!err) {
@@ -400,7 +400,7 @@ static int solve_level(struct estimate *e, int k, float (*theta)[DISNEY_N], cons
         struct tile t = { .e = e, .level = l, .begin = begin, .n = l->n - begin < TILE_TEXELS ? l->n - begin : TILE_TEXELS, .finest = finest,
                           .theta = theta, .parent_theta = parent_theta, .region = region, .scale = scale,
                           .kappa = 2 * e->set->w_reg, .w_parent = e->set->w_parent };
-        err = solve_tile(&t, l->size <= 8 ? 40 : finest && l->size > 256 ? 4 : 12, report);
+        err = solve_tile(&t, l->size <= 8 ? 40 : !finest ? 6 : l->size > 256 ? 4 : 12, report);
     }
     report->objective /= fmax((double)report->n_shaded, 1);
     return err;
@@ -598,7 +598,7 @@ static void doubt_texels(void *arg, int64_t begin, int64_t end, int worker, doub
             for (int b = 0; b <= a; b++)
                 own[packed_at(a, b)] = A[packed_at(DISNEY_N + a, DISNEY_N + b)] + (a == b ? 1e-12 : 0);
             for (int p = 0; p < DISNEY_N; p++)
-                mixed[p][a] = r->freedom[p] == PARAMETER_TIED ? A[packed_at(DISNEY_N + a, p)] : 0;
+                mixed[p][a] = r->freedom[p] != PARAMETER_FREE ? A[packed_at(DISNEY_N + a, p)] : 0;
         }
         if (r && packed_factor(3, own)) {
             for (int p = 0; p < DISNEY_N; p++)

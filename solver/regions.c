@@ -19,8 +19,8 @@ enum {
     PATCHES = 64,         // of the surface: within one, errors of the model go together
     MOST_VIEWS = 2048,
 };
-static const double least_share = .01;       // a smaller region is dissolved
-static const double worth_a_region = 1.10;   // mean squared error of views set aside, of one reflectance for two regions
+static const double least_share = .03;       // a smaller region is dissolved: what borders and rims look like, mostly
+static const double worth_a_region = 1.10;   // squared error of views set aside, of one reflectance for two regions
 static const double worth_a_parameter = .97; // the same with a parameter free per texel
 static const double worth_a_layer = 1.01;    // the same without clearcoat, sheen, ...
 static const double better_without = .99;
@@ -187,6 +187,7 @@ struct testing {
     uint16_t free_mask;  // parameters each texel has for itself
     int candidate;       // whose standard deviation is asked for
     float *std;          // [w->n]
+    float *error2;       // [w->n] mean squared error of each
 };
 
 // One texel's own values of the free parameters, drawn towards the region's. The standard deviation of the candidate.
@@ -263,16 +264,17 @@ static void test_witnesses(void *arg, int64_t begin, int64_t end, int worker, do
         else
             texel_fit(&t->s->inner, t->s->worker[worker], t->w->texel[k], 0, theta, albedo, 1, &sums);
         texel_measure(&t->s->aside, t->s->worker[worker], t->w->texel[k], theta, albedo, &error);
+        t->error2[k] = error.n ? (float)(error.squares / (3 * (double)error.n)) : 0;
         partial[0] += error.squares, partial[1] += 3 * (double)error.n;
     }
 }
 
-// Mean squared error of the views set aside.
+// Mean squared error of the views set aside. each[WITNESSES]: of every witness, or NULL.
 static int test(struct search *s, const struct witnesses *w, const float theta[DISNEY_N], uint16_t free_mask, int candidate, double *error2,
-                double *median_std)
+                double *median_std, float *each)
 {
-    float std[WITNESSES];
-    struct testing t = { s, w, theta, free_mask, candidate, std };
+    float std[WITNESSES], errors[WITNESSES];
+    struct testing t = { s, w, theta, free_mask, candidate, std, each ? each : errors };
     double sums[2] = { 0 };
     const int err = parallel_sum(s->n_threads, w->n, 4, test_witnesses, &t, 2, sums);
     *error2 = sums[0] / fmax(sums[1], 1);
@@ -513,24 +515,40 @@ static int dissolve_small(struct search *s)
     return err;
 }
 
+// By what factor the witnesses' errors grow from `alone` to `shared`: the mean over them of the logarithm, as texels are very unlike; and as
+// much less as could be chance (four standard errors).
+static double how_much_worse(const float *shared, const float *alone, int n)
+{
+    double sum = 0, squares = 0;
+    for (int k = 0; k < n; k++) {
+        const double worse = log(((double)shared[k] + rounding2) / ((double)alone[k] + rounding2));
+        sum += worse, squares += worse * worse;
+    }
+    if (n < 2)
+        return 1;
+    const double mean = sum / n, variance = fmax(squares / n - mean * mean, 0) / (n - 1);
+    return exp(mean - 4 * sqrt(variance));
+}
+
 // As long as two regions do as well under one reflectance, they are one.
 static int merge(struct search *s)
 {
     int err = 0;
     while (!err && s->out->n > 1) {
-        double least = INFINITY, alone[REGIONS_MAX];
+        double least = INFINITY, error2;
+        float alone[REGIONS_MAX][WITNESSES];
         struct witnesses w[REGIONS_MAX];
         float best_theta[DISNEY_N];
         int best_a = 0, best_b = 0;
         for (int r = 0; !err && r < s->out->n; r++) {
             call_witnesses(s, 1u << r, &w[r]);
-            err = test(s, &w[r], s->out->region[r].theta, 0, -1, &alone[r], NULL);
+            err = test(s, &w[r], s->out->region[r].theta, 0, -1, &error2, NULL, alone[r]);
         }
         for (int a = 0; !err && a < s->out->n; a++)
             for (int b = a + 1; !err && b < s->out->n; b++) {
                 struct witnesses both = { 0 }; // as many of either
                 float theta[DISNEY_N];
-                double error_a, error_b;
+                float one[WITNESSES], other[WITNESSES];
                 for (int k = 0; k < WITNESSES / 2 && k < w[a].n; k++)
                     both.texel[both.n++] = w[a].texel[(int64_t)k * w[a].n / (w[a].n < WITNESSES / 2 ? w[a].n : WITNESSES / 2)];
                 for (int k = 0; k < WITNESSES / 2 && k < w[b].n; k++)
@@ -539,15 +557,17 @@ static int merge(struct search *s)
                     theta[p] = .5f * (s->out->region[a].theta[p] + s->out->region[b].theta[p]);
                 err = fit_shared(s, &s->inner, &both, 0, false, theta);
                 if (!err)
-                    err = test(s, &w[a], theta, 0, -1, &error_a, NULL);
+                    err = test(s, &w[a], theta, 0, -1, &error2, NULL, one);
                 if (!err)
-                    err = test(s, &w[b], theta, 0, -1, &error_b, NULL);
-                const double ratio = fmax(error_a / (alone[a] + rounding2), error_b / (alone[b] + rounding2));
+                    err = test(s, &w[b], theta, 0, -1, &error2, NULL, other);
+                const double ratio = err ? INFINITY : fmax(how_much_worse(one, alone[a], w[a].n), how_much_worse(other, alone[b], w[b].n));
                 if (!err && ratio < least) {
                     least = ratio, best_a = a, best_b = b;
                     memcpy(best_theta, theta, sizeof(theta));
                 }
             }
+        if (!err && least > worth_a_region)
+            log_debug("regions: %d and %d of %d stay apart: views aside %.4f x", best_a, best_b, s->out->n, least);
         if (err || least > worth_a_region)
             break;
         log_debug("regions: %d and %d of %d become one: views aside %.4f x", best_a, best_b, s->out->n, least);
@@ -649,22 +669,25 @@ static int region_uncertainty(struct search *s, const struct witnesses *w, uint1
 
 // Does the region do without? What views set aside are better off without, or neither miss nor tell from plain by two standard deviations,
 // stays plain. Metal first: a little of it passes for anything.
-static int simplify(struct search *s, const struct witnesses *w, struct region *r, int at, uint16_t *frozen, double *error2)
+static int simplify(struct search *s, const struct witnesses *w, struct region *r, int at, uint16_t *frozen, double *error2,
+                    struct region *full)
 {
     static const uint16_t without[] = {
         1 << DISNEY_METALLIC, 1 << DISNEY_CLEARCOAT | 1 << DISNEY_CLEARCOAT_GLOSS, 1 << DISNEY_SUBSURFACE, 1 << DISNEY_SHEEN | 1 << DISNEY_SHEEN_TINT,
         1 << DISNEY_ANISOTROPIC, 1 << DISNEY_SPECULAR_TINT,
     };
-    int err = test(s, w, r->theta, 0, -1, error2, NULL);
+    int err = test(s, w, r->theta, 0, -1, error2, NULL, NULL);
     for (size_t k = 0; !err && k < sizeof(without) / sizeof(*without); k++) {
         struct region simpler = *r;
         const int p = __builtin_ctz(without[k]); // the layer's amount; the other says how it looks
         double error;
         err = region_uncertainty(s, w, *frozen, r);
+        if (!k)
+            *full = *r;
         if (!err)
             err = fit_shared(s, &s->inner, w, *frozen | without[k], false, simpler.theta);
         if (!err)
-            err = test(s, w, simpler.theta, 0, -1, &error, NULL);
+            err = test(s, w, simpler.theta, 0, -1, &error, NULL, NULL);
         if (err)
             break;
         const bool plain_enough = !((double)(r->theta[p] - plain[p]) > 2 * (double)r->std[p]);
@@ -684,12 +707,13 @@ static int choose_freedom(struct search *s, struct region *r, int at)
     // By what a texel can tell, best first (SOLVER.md 4); the rest belongs to regions.
     static const int candidates[] = { DISNEY_ROUGHNESS, DISNEY_METALLIC, DISNEY_SPECULAR, DISNEY_SUBSURFACE };
     struct witnesses w;
+    struct region full = { 0 };
     double error2 = 0, std;
     uint16_t free_mask = 0, frozen = 0;
     call_witnesses(s, 1u << at, &w);
     int err = fit_shared(s, &s->inner, &w, 0, false, r->theta);
     if (!err)
-        err = simplify(s, &w, r, at, &frozen, &error2);
+        err = simplify(s, &w, r, at, &frozen, &error2, &full);
     for (int p = 0; p < DISNEY_N; p++)
         r->freedom[p] = frozen >> p & 1 ? PARAMETER_FROZEN : PARAMETER_TIED;
     for (size_t k = 0; !err && k < sizeof(candidates) / sizeof(*candidates); k++) {
@@ -697,7 +721,7 @@ static int choose_freedom(struct search *s, struct region *r, int at)
         const uint16_t tried = (uint16_t)(free_mask | 1 << candidates[k]);
         if (frozen >> candidates[k] & 1)
             continue;
-        err = test(s, &w, r->theta, tried, candidates[k], &with, &std);
+        err = test(s, &w, r->theta, tried, candidates[k], &with, &std, NULL);
         log_debug("regions: region %d, %s free per texel: views aside %.4f -> %.4f %%, std %.3f", at, disney_parameter_names[candidates[k]],
                   100 * sqrt(error2), 100 * sqrt(with), std);
         if (!err && std < most_free_std && with + rounding2 < worth_a_parameter * error2) {
@@ -710,7 +734,13 @@ static int choose_freedom(struct search *s, struct region *r, int at)
     double cost;
     if (!err && w.n) // to the end: clearcoat against sheen is a long valley
         err = fit_from(&last, r->theta, 100, 1e-8, r->theta, &cost);
-    return err ? err : region_uncertainty(s, &w, frozen, r);
+    if (!err)
+        err = region_uncertainty(s, &w, frozen, r);
+    // What was frozen might have been otherwise: the doubt is that of the full model.
+    for (int p = 0; !err && p < DISNEY_N; p++)
+        r->std[p] = fmaxf(r->std[p], full.std[p]);
+    memcpy(r->covariance, full.covariance, sizeof(r->covariance));
+    return err;
 }
 
 // ---- the whole ----------------------------------------------------------------------------------------------------------

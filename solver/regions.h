@@ -15,7 +15,7 @@ extern const char *const parameter_freedom_names[3]; // "frozen", "tied", "free"
 struct region {
     float theta[DISNEY_N];        // of all its texels; of a free parameter: where texels begin
     float std[DISNEY_N];          // of theta as the region's: noise, and what the model lacks (regions.c); infinite: the pictures do not say, or frozen
-    double covariance[THETA_PACKED];
+    double covariance[THETA_PACKED]; // as if nothing were frozen
     enum parameter_freedom freedom[DISNEY_N];
     int n_texels;
     double aside_rmse_percent;    // of views set aside, by the region's own reflectance
