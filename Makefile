@@ -11,7 +11,7 @@ BUILD := build$(if $(filter-out release,$(VARIANT)),/$(VARIANT))
 MACHINE := $(shell uname -m)
 
 # ---- packages (Debian 12; the same names in Debian 13) ----------------------------------------------------------------
-PACKAGES := gcc make pkg-config libopenexr-dev libembree-dev libassimp-dev libjansson-dev libtiff-dev libpng-dev liblapacke-dev libopenblas-dev libcmocka-dev perl help2man
+PACKAGES := gcc make pkg-config libopenexr-dev libembree-dev libassimp-dev libjansson-dev libtiff-dev libpng-dev libexpat1-dev liblapacke-dev libopenblas-dev libcmocka-dev perl help2man
 PACKAGES_FUZZ := clang libclang-rt-dev
 PACKAGES_BENCH := libceres-dev g++ gnuplot-nox
 
@@ -24,7 +24,7 @@ CFLAGS_ALL = -std=gnu11 -D_GNU_SOURCE $(FLAGS_$(VARIANT)) -Wall -Wextra -Wshadow
   -ffp-contract=off -ffile-prefix-map=$(CURDIR)=. -pthread -I. -I/usr/include/OpenEXR -I/usr/include/Imath \
   -DSTUDIORIG_VERSION='"$(VERSION)"' $(CFLAGS)
 EMBREE = $(shell test -e /usr/include/embree4/rtcore.h && echo embree4 || echo embree3)
-LIBS = -lOpenEXRCore -l$(EMBREE) -lassimp -ljansson -ltiff -lpng -llapacke -lopenblas -lm
+LIBS = -lOpenEXRCore -l$(EMBREE) -lassimp -ljansson -ltiff -lpng -lexpat -llapacke -lopenblas -lm
 ifeq ($(MACHINE),x86_64)
 ISA_avx2 := -mavx2 -mfma -ffp-contract=fast
 ISA_avx512 := -mavx512f -mavx512dq -mavx512bw -mavx512vl -mfma -mprefer-vector-width=512 -ffp-contract=fast
@@ -32,15 +32,17 @@ endif
 
 # ---- what is built ------------------------------------------------------------------------------------------------------
 TAKE := $(addprefix solver/take/,atomic_file.c image.c image_exr.c image_hdr.c image_png.c image_tiff.c json.c log.c progress.c take.c)
-SOLVER := $(addprefix solver/,alternating.c cameras.c cameras_colmap.c compare.c csv.c disney.c joint.c levels.c lights.c lm.c materials.c mesh.c mesh_import.c \
-  normal_equations.c orientation.c panorama.c parallel.c pcg.c photometric.c rays.c regions.c relocate.c render.c samples.c shapes.c stage1.c synth.c \
-  texel_fit.c texels.c visibility.c)
+SOLVER := $(addprefix solver/,alternating.c cameras.c cameras_bundler.c cameras_colmap.c cameras_format.c cameras_frame.c cameras_meshroom.c \
+  cameras_metashape.c cameras_realitycapture.c compare.c csv.c disney.c emitters.c joint.c levels.c lights.c lm.c materials.c mesh.c mesh_gltf_floats.c \
+  mesh_import.c normal_equations.c orientation.c panorama.c parallel.c pcg.c photometric.c picture_size.c rays.c regions.c relocate.c render.c samples.c \
+  shapes.c stage1.c synth.c texel_fit.c texels.c visibility.c xml.c)
 KERNELS := $(addprefix solver/kernels/,kernels.c kernels_ref.c kernels_portable.c kernels_avx2.c kernels_avx512.c)
 COMMANDS := $(addprefix solver/commands/,arguments.c brdf.c compare.c inputs.c lights.c output.c render.c solve.c solve_materials.c synth.c visibility.c)
 LIBRARY := $(TAKE) $(SOLVER) $(KERNELS)
-FUZZED := $(TAKE) $(addprefix solver/,cameras.c cameras_colmap.c csv.c lights.c mesh.c mesh_import.c orientation.c panorama.c parallel.c texels.c)
-TESTS := $(addprefix test_,brdf cameras compare csv disney image joint json judge levels lights lm materials mesh normal_equations orientation panorama parallel pcg photometric rays render samples shapes synth take texels vec3 visibility) check_kernels
-FUZZERS := cameras csv exr hdr json lights mesh
+FUZZED := $(TAKE) $(addprefix solver/,cameras.c cameras_bundler.c cameras_colmap.c cameras_format.c cameras_meshroom.c cameras_metashape.c \
+  cameras_realitycapture.c csv.c lights.c mesh.c mesh_gltf_floats.c mesh_import.c orientation.c panorama.c parallel.c picture_size.c texels.c xml.c)
+TESTS := $(addprefix test_,brdf cameras cameras_import compare csv disney image joint json judge levels lights lm materials mesh normal_equations orientation panorama parallel pcg photometric rays render samples shapes synth take texels vec3 visibility) check_kernels
+FUZZERS := cameras cameras_import csv exr hdr json lights mesh
 
 # ---- rules --------------------------------------------------------------------------------------------------------------
 object = $(patsubst %.c,$(BUILD)/obj/%.o,$(1))

@@ -9,7 +9,6 @@
 #include <stdio.h>
 #include <stdlib.h>
 #include <string.h>
-#include <strings.h>
 #include <sys/stat.h>
 
 static const double min_depth = 1e-9;
@@ -69,50 +68,50 @@ static bool is_monotonic(const struct camera *c, double s) // s: r^2, fisheye: a
     return polynomial_is_positive(d, 3, s) && polynomial_is_positive(slope, MAX_DEGREE, s);
 }
 
+static bool has_tangential(const struct camera *c)
+{
+    return c->p[0] != 0 || c->p[1] != 0;
+}
+
 static bool is_undistorted(const struct camera *c)
 {
     for (int i = 0; i < 6; i++)
         if (c->k[i] != 0)
             return false;
-    return c->model != CAMERA_FISHEYE && c->p[0] == 0 && c->p[1] == 0;
+    return c->model != CAMERA_FISHEYE && !has_tangential(c);
 }
 
-// d[2] = distorted (x, y), D = its 2x2 derivative. False beyond the monotonic range.
-static bool distort(const struct camera *c, double x, double y, double d[2], double D[4])
+// From (X/Z, Y/Z) to the same direction with the angle, not its tangent, as radius; A: the (symmetric) 2x2 derivative.
+static void to_angles(double x, double y, double a[2], double A[4])
+{
+    const double s = x * x + y * y, r = sqrt(s);
+    double f = 1 - s / 3, f_s = -1. / 3; // series: atan r = r - r^3 / 3
+    if (r >= 1e-4)
+        f = atan(r) / r, f_s = (1 / (1 + s) - f) / (2 * s);
+    a[0] = x * f, a[1] = y * f;
+    A[0] = f + 2 * x * x * f_s, A[1] = A[2] = 2 * x * y * f_s, A[3] = f + 2 * y * y * f_s;
+}
+
+// The polynomial part, in tangents (fisheye: in angles). d[2] = distorted (x, y), D = its 2x2 derivative. False beyond the
+// monotonic range.
+static bool distort_plane(const struct camera *c, double x, double y, double d[2], double D[4])
 {
     const double *k = c->k, *p = c->p;
     const double s = x * x + y * y;
     double f, f_s; // radial factor, and its derivative by s = r^2
-    if (is_undistorted(c)) {
-        d[0] = x, d[1] = y;
-        D[0] = D[3] = 1, D[1] = D[2] = 0;
-        return true;
-    }
-    if (c->model == CAMERA_FISHEYE) {
-        const double r = sqrt(s), a = atan(r), a2 = a * a;
-        const double ad = a * (1 + a2 * (k[0] + a2 * (k[1] + a2 * (k[2] + a2 * k[3]))));
-        const double slope = 1 + a2 * (3 * k[0] + a2 * (5 * k[1] + a2 * (7 * k[2] + a2 * 9 * k[3])));
-        if (!is_monotonic(c, a2))
-            return false;
-        if (r < 1e-4) // series: a = r - r^3 / 3
-            f = 1 + (k[0] - 1. / 3) * s, f_s = k[0] - 1. / 3;
-        else
-            f = ad / r, f_s = (slope / (1 + s) - f) / (2 * s);
+    if (!is_monotonic(c, s))
+        return false;
+    if (c->model == CAMERA_RATIONAL) {
+        const double n = 1 + s * (k[0] + s * (k[1] + s * k[2])), m = 1 + s * (k[3] + s * (k[4] + s * k[5]));
+        const double n_s = k[0] + s * (2 * k[1] + s * 3 * k[2]), m_s = k[3] + s * (2 * k[4] + s * 3 * k[5]);
+        f = n / m, f_s = (n_s - f * m_s) / m;
     } else {
-        if (!is_monotonic(c, s))
-            return false;
-        if (c->model == CAMERA_BROWN) {
-            f = 1 + s * (k[0] + s * (k[1] + s * (k[2] + s * k[3])));
-            f_s = k[0] + s * (2 * k[1] + s * (3 * k[2] + s * 4 * k[3]));
-        } else {
-            const double n = 1 + s * (k[0] + s * (k[1] + s * k[2])), m = 1 + s * (k[3] + s * (k[4] + s * k[5]));
-            const double n_s = k[0] + s * (2 * k[1] + s * 3 * k[2]), m_s = k[3] + s * (2 * k[4] + s * 3 * k[5]);
-            f = n / m, f_s = (n_s - f * m_s) / m;
-        }
+        f = 1 + s * (k[0] + s * (k[1] + s * (k[2] + s * k[3])));
+        f_s = k[0] + s * (2 * k[1] + s * (3 * k[2] + s * 4 * k[3]));
     }
     d[0] = x * f, d[1] = y * f;
     D[0] = f + 2 * x * x * f_s, D[1] = D[2] = 2 * x * y * f_s, D[3] = f + 2 * y * y * f_s;
-    if (c->model != CAMERA_FISHEYE && (p[0] != 0 || p[1] != 0)) {
+    if (has_tangential(c)) {
         const double tx = 2 * p[0] * x * y + p[1] * (s + 2 * x * x), ty = 2 * p[1] * x * y + p[0] * (s + 2 * y * y);
         const double g = 1 + s * (p[2] + s * p[3]), g_s = p[2] + 2 * s * p[3];
         d[0] += tx * g, d[1] += ty * g;
@@ -124,11 +123,29 @@ static bool distort(const struct camera *c, double x, double y, double d[2], dou
     return isfinite(d[0]) && isfinite(d[1]);
 }
 
-// Newton with halved steps where a full one does not help. False: no solution near.
+static bool distort(const struct camera *c, double x, double y, double d[2], double D[4])
+{
+    double a[2], A[4], B[4];
+    if (is_undistorted(c)) {
+        d[0] = x, d[1] = y;
+        D[0] = D[3] = 1, D[1] = D[2] = 0;
+        return true;
+    }
+    if (c->model != CAMERA_FISHEYE)
+        return distort_plane(c, x, y, d, D);
+    to_angles(x, y, a, A);
+    if (!distort_plane(c, a[0], a[1], d, B))
+        return false;
+    D[0] = B[0] * A[0] + B[1] * A[2], D[1] = B[0] * A[1] + B[1] * A[3];
+    D[2] = B[2] * A[0] + B[3] * A[2], D[3] = B[2] * A[1] + B[3] * A[3];
+    return true;
+}
+
+// The inverse of distort_plane: Newton, with halved steps where a full one does not help. False: no solution near.
 static bool undistort_newton(const struct camera *c, const double d[2], double xy[2])
 {
     double x = d[0], y = d[1], e[2], D[4];
-    while (!distort(c, x, y, e, D)) { // start inside the model's range
+    while (!distort_plane(c, x, y, e, D)) { // start inside the model's range
         x *= .5, y *= .5;
         if (fabs(x) + fabs(y) < 1e-12)
             return false;
@@ -146,7 +163,7 @@ static bool undistort_newton(const struct camera *c, const double d[2], double x
         for (;; step *= .5) {
             if (step < 1e-6) // as good as it gets
                 goto done;
-            if (!distort(c, x + step * sx, y + step * sy, e, D))
+            if (!distort_plane(c, x + step * sx, y + step * sy, e, D))
                 continue;
             if (hypot(e[0] - d[0], e[1] - d[1]) < before)
                 break;
@@ -245,13 +262,17 @@ bool camera_ray(const struct camera *c, const double uv_px[2], double dir_world[
     if (!isfinite(d[0]) || !isfinite(d[1]))
         return false;
     if (c->model == CAMERA_FISHEYE) {
-        const double ad = hypot(d[0], d[1]);
         double a;
-        if (!fisheye_angle(c, ad, &a))
+        if (has_tangential(c)) {
+            if (!undistort_newton(c, d, d))
+                return false;
+            a = hypot(d[0], d[1]);
+        } else if (!fisheye_angle(c, hypot(d[0], d[1]), &a)) {
             return false;
-        const double sine_per_ad = ad > 1e-12 ? sin(a) / ad : 1;
-        q[0] = d[0] * sine_per_ad, q[1] = d[1] * sine_per_ad, q[2] = cos(a);
-        if (!(q[2] > 0))
+        }
+        const double length = hypot(d[0], d[1]), sine = length > 1e-12 ? sin(a) / length : 1;
+        q[0] = d[0] * sine, q[1] = d[1] * sine, q[2] = cos(a);
+        if (!(a < M_PI_2 && q[2] > 0))
             return false;
     } else if (is_undistorted(c)) {
         q[0] = d[0], q[1] = d[1], q[2] = 1;
@@ -314,137 +335,119 @@ void cameras_free(struct cameras *c)
     memset(c, 0, sizeof(*c));
 }
 
-int camera_set_name(struct camera *c, const char *file, size_t n_file)
+// ---- which reader -------------------------------------------------------------------------------------------------------
+
+// COLMAP comes first: in a folder, its files win over sidecars lying beside them.
+static const struct cameras_format {
+    const char *name;
+    bool (*probe)(const struct cameras_source *s);
+    int (*read)(struct cameras *out, const struct cameras_source *s);
+} formats[] = {
+    { "COLMAP", cameras_colmap_probe, cameras_colmap_read },
+    { "Bundler", cameras_bundler_probe, cameras_bundler_read },
+    { "Agisoft Metashape XML", cameras_metashape_probe, cameras_metashape_read },
+    { "RealityCapture", cameras_realitycapture_probe, cameras_realitycapture_read },
+    { "Meshroom (AliceVision SfMData JSON)", cameras_meshroom_probe, cameras_meshroom_read },
+};
+
+static const struct cameras_format *format_of(const struct cameras_source *s)
 {
-    const char *slash = memrchr(file, '/', n_file);
-    if (slash)
-        n_file -= (size_t)(slash + 1 - file), file = slash + 1;
-    const char *dot = memrchr(file, '.', n_file);
-    if (dot && dot > file)
-        n_file = (size_t)(dot - file);
-    if (n_file == 0 || n_file >= sizeof(c->name))
-        return -EINVAL;
-    for (size_t i = 0; i < n_file; i++)
-        if ((unsigned char)file[i] < ' ' || file[i] == 0x7f)
-            return -EINVAL;
-    memcpy(c->name, file, n_file);
-    c->name[n_file] = 0;
+    for (size_t i = 0; i < sizeof(formats) / sizeof(formats[0]); i++)
+        if (formats[i].probe(s))
+            return &formats[i];
+    return NULL;
+}
+
+// A file's first bytes. 0 or -errno (not logged).
+static int look_at(struct cameras_source *s, char *head, size_t n_head)
+{
+    struct stat st;
+    head[0] = 0;
+    s->head = head, s->n_head = 0;
+    if (stat(s->path, &st))
+        return -errno;
+    s->is_folder = S_ISDIR(st.st_mode);
+    if (s->is_folder)
+        return 0;
+    FILE *f = S_ISREG(st.st_mode) ? fopen(s->path, "rbe") : NULL;
+    if (!f)
+        return S_ISREG(st.st_mode) ? -errno : -EINVAL;
+    s->n_head = fread(head, 1, n_head - 1, f);
+    head[s->n_head] = 0;
+    fclose(f);
     return 0;
 }
 
-static int compare_names(const void *a, const void *b)
-{
-    const struct camera *const *x = a, *const *y = b;
-    return strcmp((*x)->name, (*y)->name);
-}
+static const char expected[] = "COLMAP's cameras and images (.bin or .txt), a Bundler bundle.out, a Metashape XML, RealityCapture "
+                               "XMP sidecars or CSV, or Meshroom's sfm JSON";
 
-int cameras_check_names(const struct cameras *c, const char *path)
+// The one file in a folder that is of a known format.
+static int read_from_folder(struct cameras *out, const struct cameras_source *folder)
 {
-    int err = 0;
-    const struct camera **sorted = malloc((size_t)c->n * sizeof(*sorted));
-    if (!sorted)
-        return -ENOMEM;
-    for (int i = 0; i < c->n; i++)
-        sorted[i] = &c->view[i];
-    qsort(sorted, (size_t)c->n, sizeof(*sorted), compare_names);
-    for (int i = 1; i < c->n && !err; i++)
-        if (!strcmp(sorted[i - 1]->name, sorted[i]->name)) {
-            log_error("cameras: %s: two images are called '%s' (folder and extension apart); rename one: views are known "
-                      "by that name", path, sorted[i]->name);
+    struct dirent **entries = NULL;
+    char *found = NULL;
+    const struct cameras_format *format = NULL;
+    int n = scandir(folder->path, &entries, NULL, cameras_by_name), err = n < 0 ? -errno : 0;
+    if (err)
+        log_error("cameras: cannot list %s: %s", folder->path, strerror(-err));
+    for (int i = 0; i < n; i++) {
+        char *path = NULL, head[4096];
+        struct cameras_source s = *folder;
+        const struct cameras_format *is = NULL;
+        if (!err && entries[i]->d_name[0] != '.' && asprintf(&path, "%s/%s", folder->path, entries[i]->d_name) >= 0) {
+            s.path = path, s.is_listed = true;
+            if (!look_at(&s, head, sizeof(head)) && !s.is_folder)
+                is = format_of(&s);
+        }
+        free(entries[i]);
+        if (is && found) {
+            log_error("cameras: %s holds both %s (%s) and %s (%s); leave one of them, or name it", folder->path, found, format->name,
+                      path, is->name);
             err = -EINVAL;
         }
-    free(sorted);
+        if (is && !found)
+            found = path, format = is;
+        else
+            free(path);
+    }
+    free(entries);
+    if (!err && !found) {
+        log_error("cameras: %s: no cameras in this folder; expected %s", folder->path, expected);
+        err = -EINVAL;
+    }
+    if (!err) {
+        char head[4096];
+        struct cameras_source s = *folder;
+        s.path = found;
+        err = look_at(&s, head, sizeof(head));
+        if (!err)
+            err = format->read(out, &s);
+    }
+    free(found);
     return err;
 }
 
-// ---- which reader -------------------------------------------------------------------------------------------------------
-
-static bool starts_with(const char *text, const char *prefix)
+int cameras_read_with(struct cameras *out, const char *path, const struct cameras_options *options)
 {
-    return !strncmp(text, prefix, strlen(prefix));
-}
-
-static bool is_bundler(const struct cameras_source *s)
-{
-    return starts_with(s->head, "# Bundle file");
-}
-
-static bool is_metashape(const struct cameras_source *s)
-{
-    return strstr(s->head, "<document") && s->head[strspn(s->head, " \t\r\n\xef\xbb\xbf")] == '<';
-}
-
-static bool has_xmp_sidecars(const char *folder)
-{
-    DIR *dir = opendir(folder);
-    bool found = false;
-    for (struct dirent *e = dir ? readdir(dir) : NULL; e && !found; e = readdir(dir)) {
-        const size_t n = strlen(e->d_name);
-        found = n > 4 && !strcasecmp(e->d_name + n - 4, ".xmp");
-    }
-    if (dir)
-        closedir(dir);
-    return found;
-}
-
-static bool is_reality_capture(const struct cameras_source *s)
-{
-    return s->is_folder ? has_xmp_sidecars(s->path)
-                        : strstr(s->head, "x:xmpmeta") || strstr(s->head, "capturingreality.com");
-}
-
-static bool is_meshroom(const struct cameras_source *s)
-{
-    return s->head[strspn(s->head, " \t\r\n\xef\xbb\xbf")] == '{' &&
-           (strstr(s->head, "\"views\"") || strstr(s->head, "\"featuresFolders\"") ||
-            strstr(s->head, "\"intrinsics\""));
-}
-
-// COLMAP comes first: in a folder, its files win over sidecars lying beside them.
-static const struct cameras_format formats[] = {
-    { "COLMAP", cameras_colmap_probe, cameras_colmap_read },
-    { "Bundler bundle.out", is_bundler, NULL },
-    { "Agisoft Metashape cameras XML", is_metashape, NULL },
-    { "RealityCapture XMP", is_reality_capture, NULL },
-    { "Meshroom (AliceVision SfMData JSON)", is_meshroom, NULL },
-};
-
-int cameras_read(struct cameras *out, const char *path)
-{
-    char head[4096] = "";
-    struct stat st;
-    struct cameras_source s = { .path = path, .head = head };
+    char head[4096];
+    static const struct cameras_options nothing;
+    struct cameras_source s = { .path = path, .options = options ? options : &nothing };
     memset(out, 0, sizeof(*out));
-    FILE *f = NULL;
-    int err = stat(path, &st) ? -errno : 0;
-    s.is_folder = !err && S_ISDIR(st.st_mode);
-    if (!err && !s.is_folder) {
-        f = S_ISREG(st.st_mode) ? fopen(path, "rbe") : NULL;
-        err = f ? 0 : S_ISREG(st.st_mode) ? -errno : -EINVAL;
-    }
+    const int err = look_at(&s, head, sizeof(head));
     if (err) {
         log_error("cameras: cannot open %s: %s", path, strerror(-err));
         return err;
     }
-    if (f) {
-        s.n_head = fread(head, 1, sizeof(head) - 1, f);
-        head[s.n_head] = 0;
-        fclose(f);
-    }
-    for (size_t i = 0; i < sizeof(formats) / sizeof(formats[0]); i++) {
-        if (!formats[i].probe(&s))
-            continue;
-        if (formats[i].read)
-            return formats[i].read(out, &s);
-        log_error("cameras: %s: this is %s, which is not read yet; export the cameras in COLMAP format "
-                  "(cameras.txt and images.txt)", path, formats[i].name);
-        return -ENOTSUP;
-    }
+    const struct cameras_format *format = format_of(&s);
+    if (format)
+        return format->read(out, &s);
     if (s.is_folder)
-        log_error("cameras: %s: no cameras in this folder; expected COLMAP's cameras.bin and images.bin, or cameras.txt and "
-                  "images.txt", path);
-    else
-        log_error("cameras: %s: not a known camera file; expected a folder with COLMAP's cameras and images, .bin or "
-                  ".txt", path);
+        return read_from_folder(out, &s);
+    log_error("cameras: %s: not a known camera file; expected %s", path, expected);
     return -EINVAL;
+}
+
+int cameras_read(struct cameras *out, const char *path)
+{
+    return cameras_read_with(out, path, NULL);
 }

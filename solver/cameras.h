@@ -5,7 +5,8 @@
 //   BROWN    s = 1 + k1 r2 + k2 r4 + k3 r6 + k4 r8;  xd = x s + (2 p1 x y + p2 (r2 + 2 x^2)) (1 + p3 r2 + p4 r4), yd likewise
 //            (OpenCV's p1, p2 order; no distortion: all zero)
 //   RATIONAL s = (1 + k1 r2 + k2 r4 + k3 r6) / (1 + k4 r2 + k5 r4 + k6 r6); tangential as BROWN
-//   FISHEYE  a = atan2(r, z); ad = a (1 + k1 a^2 + k2 a^4 + k3 a^6 + k4 a^8); (xd, yd) = (x, y) ad / r
+//   FISHEYE  (xa, ya) = (x, y) atan(r) / r, then BROWN on (xa, ya): a = atan r, ad = a (1 + k1 a^2 + ... + k4 a^8), tangential
+//            terms in (xa, ya) (Metashape's; zero in OpenCV's)
 // u = fx xd + skew yd + cx, v = fy yd + cy.
 #pragma once
 #include <stdbool.h>
@@ -29,12 +30,26 @@ struct cameras {
     struct camera *view; // [n], in the file's order
 };
 
-// Read any supported format: `path` is a folder (COLMAP text or binary; binary wins when both are there) or a file. The format
-// is known by content. Now: COLMAP. Bundler, Metashape, RealityCapture and Meshroom files are recognised and refused by
-// name (-ENOTSUP). Errors, logged with file, line or offset, found, expected, remedy: -errno of the open, -EINVAL, -ENOTSUP,
-// -ENOMEM. Counts are checked against the file's size before anything is allocated. Points are ignored. Two images of one stem
-// are refused, and so is text without its last line end: a file cut short must not pass for a shorter one.
+// What a reader cannot know from the file. NULL, or zeroed: nothing.
+struct cameras_options {
+    // How large the picture of a view is: RealityCapture and Bundler files do not say. Returns 0, or -ENOENT where it cannot know; then
+    // (or if it is NULL) pictures of that name beside the camera file are looked at. Views whose size stays unknown are left
+    // out, with a warning.
+    int (*picture_size)(void *arg, const char *name, int *width_px, int *height_px);
+    void *arg;
+    bool without_transform; // Metashape: cameras in the chunk's own frame, without the component's or chunk's transform
+    bool *has_transform;    // NULL, or set to true where the file has such a transform
+};
+
+// Read any supported format: `path` is a file, or a folder that holds one (COLMAP's text or binary, binary wins; XMP sidecars; or
+// just one file of another format). Formats are known by content: COLMAP, Bundler 0.3 (with its list.txt), Agisoft Metashape
+// XML, RealityCapture XMP and CSV, Meshroom (AliceVision) SfMData JSON. Errors, logged with file, line or offset, found,
+// expected, remedy: -errno of the open, -EINVAL, -ENOTSUP (models and rigs that are not read, by name), -ENOMEM. Counts are
+// checked against the file's size before anything is allocated. Points are ignored; cameras that the tool did not place, or that
+// the user disabled, are left out. Two images of one stem are refused, and so is text without its last line end: a file cut
+// short must not pass for a shorter one.
 int cameras_read(struct cameras *out, const char *path);
+int cameras_read_with(struct cameras *out, const char *path, const struct cameras_options *options);
 void cameras_free(struct cameras *c); // leaves it zeroed
 
 // Each view gets a camera of its own and the image name NAME.exr (a take's). dir is made if need be. 0, -ENOTSUP (skew, BROWN's

@@ -693,6 +693,8 @@ static int colmap_model_of(const struct camera *c)
         what = "skew";
     else if (c->model == CAMERA_BROWN && k[3] != 0)
         what = "k4 (r^8)";
+    else if (c->model == CAMERA_FISHEYE && (p[0] != 0 || p[1] != 0))
+        what = "p1 or p2 in a fisheye";
     else if (c->model != CAMERA_FISHEYE && (p[2] != 0 || p[3] != 0) && (p[0] != 0 || p[1] != 0))
         what = "p3 or p4";
     if (what) {

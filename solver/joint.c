@@ -16,7 +16,7 @@ struct joint_settings joint_defaults(enum method method)
 {
     return (struct joint_settings){ .method = method, .w_sim = method == METHOD_ALTERNATING ? 1e-3 : -1,
                                     .start_distance_m = method == METHOD_ALTERNATING ? 2 : 0, .visibility = method == METHOD_JOINT,
-                                    .robust = false };
+                                    .planes = method == METHOD_JOINT, .robust = false };
 }
 
 const char *joint_doubt_text(unsigned one_bit)
@@ -41,28 +41,38 @@ const char *joint_doubt_text(unsigned one_bit)
 
 static const double first_w_sim = 1e-3; // of the continuation, and of the sweep
 
-// Runs of `run` lights become one: the sum of their irradiance, from its mean direction.
-static int merge_lights(struct lights *out, const struct lights *fine, int run)
+// Of each group, every `run` neighbours become one light: the sum of their irradiance, from its mean direction. run 0: the whole group.
+static int merge_lights(struct lights *out, int32_t *group, const struct lights *fine, const int32_t *fine_group, int run)
 {
-    const int err = lights_new(out, fine->n / run);
+    int n = 0, since = 0;
+    for (int i = 0; i < fine->n; i++) { // group[] of the fine ones first
+        if (i == 0 || fine_group[i] != fine_group[i - 1] || (run && since == run))
+            n++, since = 0;
+        since++;
+    }
+    const int err = lights_new(out, n);
     if (err)
         return err;
     memcpy(out->centre_m, fine->centre_m, sizeof(out->centre_m));
     memcpy(out->world_from_probe, fine->world_from_probe, sizeof(out->world_from_probe));
-    for (int i = 0; i < out->n; i++) {
+    for (int i = 0, first = 0; i < n; i++) {
         double d[3] = { 0 };
-        for (int k = i * run; k < (i + 1) * run; k++) {
+        int k = first;
+        for (; k < fine->n && fine_group[k] == fine_group[first] && (!run || k < first + run); k++) {
             const double *C = fine->irradiance[k];
             vec3_add_scaled(d, d, C[0] + C[1] + C[2], fine->dir_probe[k]);
             vec3_add_scaled(out->irradiance[i], out->irradiance[i], 1, C);
         }
         if (vec3_normalise(d) == 0)
-            memcpy(d, fine->dir_probe[i * run], sizeof(d));
+            memcpy(d, fine->dir_probe[first], sizeof(d));
         memcpy(out->dir_probe[i], d, sizeof(d));
-        out->inverse_distance[i] = fine->inverse_distance[i * run];
+        out->inverse_distance[i] = fine->inverse_distance[first];
+        group[i] = fine_group[first];
+        first = k;
     }
     return 0;
 }
+
 // Few are enough to follow the valley, more to tell one weight from the next and for the last word; the albedo is then
 // solved for every texel.
 enum { SWEEP_SAMPLES = 30000, COARSE_SAMPLES = 30000, FINE_SAMPLES = 200000 };
@@ -106,6 +116,28 @@ static int sweep(const struct photometric *p, const struct lights *lights, const
 
 // Half floats and bilinear look-ups leave about this much (percent of white) in any comparison; to gain less is to gain nothing.
 static const double floor_percent = .03;
+// A plane's lights are held on it this much harder than neighbours on one sphere, of which each has 8 at 1 / |dh_i - dh_j|^2 ~ 50.
+static const double plane_share = 400, first_plane_w_sim = 1e-5, plane_tolerance = .06;
+
+// Lights that lie on one plane by now are held on it.
+static int find_planes(struct stage1 *s, double tolerance, double w_plane)
+{
+    struct emitters planes;
+    const int first = s->layout.inverse_distance, n_groups = s->p.n_groups;
+    double q[n_groups];
+    int n_on = 0;
+    photometric_pack(&s->p, &s->base, s->x);
+    for (int g = 0; g < n_groups; g++)
+        q[g] = s->is_free[first + g] ? s->x[first + g] : 0;
+    const int err = emitters_find(&planes, n_groups, (const double(*)[3])s->group_dir, q, tolerance);
+    if (err)
+        return err;
+    for (int g = 0; g < n_groups; g++)
+        n_on += planes.of[g] >= 0;
+    log_debug("joint: %d of %d lights on %d planes", n_on, n_groups, planes.n);
+    stage1_set_planes(s, &planes, w_plane);
+    return 0;
+}
 
 // Continuation: w_sim falls by decades, and after each step the views set aside are measured. Kept is the *largest* weight whose
 // error is within 3 % of the best, or within the pictures' own rounding: below that, lights that the pictures hardly see drift off
@@ -121,6 +153,10 @@ static int continuation(struct stage1 *s, const uint8_t *aside)
     for (double w = first_w_sim; !err && n < MAX_STEPS; w = w > 1e-13 ? w / 10 : 0) {
         struct photometric_error e;
         s->w_sim = weight[n] = w > last ? w : last;
+        if (s->set->planes && w <= first_plane_w_sim)
+            err = find_planes(s, plane_tolerance, plane_share * s->w_sim);
+        if (err)
+            break;
         s->p.texel_step = stage1_step_for(s, COARSE_SAMPLES);
         err = stage1_trace_visibility(s);
         if (!err)
@@ -150,6 +186,9 @@ static int continuation(struct stage1 *s, const uint8_t *aside)
             chosen = n - 1;
         photometric_state_copy(&s->p, &s->base, &at[chosen]);
         s->w_sim = weight[chosen];
+        log_debug("joint: w_sim %.0e it is", s->w_sim);
+        if (s->set->planes)
+            err = find_planes(s, plane_tolerance, plane_share * s->w_sim);
     }
     progress_end();
     for (int i = 0; i < MAX_STEPS; i++)
@@ -187,28 +226,26 @@ static int refine(struct stage1 *s, const uint8_t *fit)
 static int solve_joint(struct stage1 *s, const struct photometric *p, const struct lights *lights, const uint8_t *fit,
                        struct joint_result *out)
 {
-    const int n_views = s->layout.n_views, run = lights->n / p->n_groups, coarse_run = run < 4 ? run : 4;
+    const int n_views = s->layout.n_views, run = lights->n / (4 * p->n_groups);
     struct lights one = { 0 }, few = { 0 };
     struct photometric coarse = *p;
     struct photometric_state start = { 0 };
     struct stage1 c = { 0 };
     double cost, mirrored_cost;
-    int32_t *group = malloc((size_t)lights->n * sizeof(*group));
+    int32_t *group = malloc((size_t)lights->n * sizeof(*group)), *few_group = malloc((size_t)lights->n * sizeof(*group));
     uint8_t *inner = malloc((size_t)n_views), *aside = malloc((size_t)n_views);
-    int err = group && inner && aside ? 0 : -ENOMEM, seen = 0;
+    int err = group && few_group && inner && aside ? 0 : -ENOMEM, seen = 0;
     for (int v = 0; !err && v < n_views; v++) {
         aside[v] = fit[v] && seen++ % 6 == 3;
         inner[v] = fit[v] && !aside[v];
     }
     if (!err)
-        err = merge_lights(&one, lights, run);
+        err = merge_lights(&one, group, lights, p->group_of_light, 0);
     if (!err)
-        err = merge_lights(&few, lights, run / coarse_run);
+        err = merge_lights(&few, few_group, lights, p->group_of_light, run > 1 ? run : 1);
     if (err)
         goto end;
     coarse.group_of_light = group;
-    for (int i = 0; i < one.n; i++)
-        group[i] = i;
     err = photometric_state_new(&start, &coarse, &one);
     if (!err)
         err = sweep(&coarse, &one, s->rays, s->set, &start, &cost, s);
@@ -226,8 +263,7 @@ static int solve_joint(struct stage1 *s, const struct photometric *p, const stru
     if (err)
         goto end;
     photometric_pack(&coarse, &start, s->x);
-    for (int i = 0; i < few.n; i++)
-        group[i] = i / coarse_run;
+    coarse.group_of_light = few_group;
     err = stage1_new(&c, &coarse, &few, s->rays, s->set);
     if (err)
         goto end;
@@ -240,6 +276,8 @@ static int solve_joint(struct stage1 *s, const struct photometric *p, const stru
     photometric_pack(&c.p, &c.base, s->x);
     memcpy(s->base.lights.world_from_probe, c.base.lights.world_from_probe, sizeof(start.lights.world_from_probe));
     photometric_unpack(&s->p, &s->base, s->x);
+    if (c.emitters.n)
+        stage1_set_planes(s, &c.emitters, c.w_plane);
     memcpy(s->base.albedo, c.base.albedo, (size_t)p->texels->n * sizeof(*c.base.albedo));
     s->w_sim = c.w_sim;
     s->n_jacobians += c.n_jacobians, s->n_evaluations += c.n_evaluations;
@@ -250,6 +288,7 @@ end:
     lights_free(&one);
     lights_free(&few);
     free(group);
+    free(few_group);
     free(inner);
     free(aside);
     return err;
@@ -339,7 +378,7 @@ int joint_solve(struct joint_result *out, const struct texels *texels, const str
     out->inverse_distance_std = calloc((size_t)n_groups, sizeof(double));
     int err = fit && held && per_view && group_of_light && out->inverse_distance_std ? 0 : -ENOMEM, n_fit_views = 0, n_held = 0;
     for (int i = 0; !err && i < lights->n; i++)
-        group_of_light[i] = i / (lights->n / n_groups);
+        group_of_light[i] = lights->group[i] >= 0 ? lights->group[i] : i / (lights->n / n_groups);
     for (int64_t i = 0; !err && i < samples->n; i++)
         per_view[samples->view[i]]++;
     for (int v = 0; !err && v < samples->n_views; v++) {

@@ -22,6 +22,7 @@ struct joint_settings {
     double w_sim;            // alternating: weight of Eq. 11 beside the *sum* of squared residuals (paper). joint: the last weight of the
                              // continuation, beside the *mean*; negative: stopped by the views set aside (default)
     bool visibility;         // trace shadows, and again when lights have moved
+    bool planes;             // joint: lights that lie on one plane, if the views set aside accept it, stay on it
     bool robust;             // down-weight outliers in the last stage
     bool gain;               // one unknown exposure factor per camera (prior 2 %)
     int n_threads;
@@ -53,7 +54,8 @@ struct joint_result {
     unsigned doubts;                 // 0: trusted
 };
 
-// lights: from the panorama, with the rough set-up (centre, rotation) in it; aligned runs of lights / n_groups form a group. hold_out[n_views]: 1 = never
+// lights: from the panorama, with the rough set-up (centre, rotation) in it; lights->group (0 ..
+// n_groups - 1, ascending; lights_refine) says which share a distance; all -1: aligned runs of n / n_groups do. hold_out[n_views]: 1 = never
 // fitted, only reported. rays may be NULL (no visibility). Progress through progress.h. 0, -EINVAL (logged), -ENOMEM.
 int joint_solve(struct joint_result *out, const struct texels *texels, const struct samples *samples,
                 const struct rays *rays, const struct lights *lights, int n_groups,

@@ -270,31 +270,21 @@ static void cut(const struct cutter *k, const struct light_region *r, int first,
     }
 }
 
-int lights_median_cut(struct lights *out, const struct panorama *p, int n)
+static void cutter_free(struct cutter *k)
+{
+    free(k->sin_lon);
+}
+
+// Tables and the lights to fill. 0 or -ENOMEM.
+static int cutter_new(struct cutter *k, const struct panorama *p, struct lights *l, int n)
 {
     const int width = p->image.width, height = p->image.height;
-    struct lights l = {0};
-    memset(out, 0, sizeof(*out));
-    if (n < 1 || n > LIGHTS_MAX || (n & (n - 1))) {
-        log_error("lights: cannot cut a panorama into %d lights: expected a power of two from 1 "
-                  "to %d",
-                  n, LIGHTS_MAX);
-        return -EINVAL;
-    }
-    int err = lights_new(&l, n);
     double *tables = malloc(((size_t)width * 3 + (size_t)height * 3) * sizeof(double));
-    if (err || !tables)
-        goto no_memory;
-    l.region = calloc((size_t)n, sizeof(*l.region));
-    l.spread_rad = calloc((size_t)n, sizeof(*l.spread_rad));
-    if (!l.region || !l.spread_rad)
-        goto no_memory;
-    l.panorama_width_px = width, l.panorama_height_px = height;
-    const struct cutter k = {
+    *k = (struct cutter){
         .p = p,
         .width = width,
         .height = height,
-        .out = &l,
+        .out = l,
         .sin_lon = tables,
         .cos_lon = tables + width,
         .along = tables + 2 * (size_t)width,
@@ -302,23 +292,119 @@ int lights_median_cut(struct lights *out, const struct panorama *p, int n)
         .cos_lat = tables + 3 * (size_t)width + height,
         .omega = tables + 3 * (size_t)width + 2 * (size_t)height,
     };
+    if (!tables || lights_new(l, n))
+        return -ENOMEM;
+    l->region = calloc((size_t)n, sizeof(*l->region));
+    l->spread_rad = calloc((size_t)n, sizeof(*l->spread_rad));
+    if (!l->region || !l->spread_rad)
+        return -ENOMEM;
+    l->panorama_width_px = width, l->panorama_height_px = height;
     for (int x = 0; x < width; x++) {
         const double lon = M_PI - 2 * M_PI * (x + .5) / width;
-        k.sin_lon[x] = sin(lon), k.cos_lon[x] = cos(lon);
+        k->sin_lon[x] = sin(lon), k->cos_lon[x] = cos(lon);
     }
     for (int y = 0; y < height; y++) {
         const double lat = M_PI / 2 - M_PI * (y + .5) / height;
-        k.sin_lat[y] = sin(lat), k.cos_lat[y] = cos(lat);
-        k.omega[y] = panorama_solid_angle(width, height, y);
+        k->sin_lat[y] = sin(lat), k->cos_lat[y] = cos(lat);
+        k->omega[y] = panorama_solid_angle(width, height, y);
     }
-    cut(&k, &(struct light_region){0, 0, width, height}, 0, n);
-    free(tables);
-    *out = l;
     return 0;
-no_memory:
-    free(tables);
+}
+
+int lights_median_cut(struct lights *out, const struct panorama *p, int n)
+{
+    struct lights l = {0};
+    struct cutter k;
+    memset(out, 0, sizeof(*out));
+    if (n < 1 || n > LIGHTS_MAX || (n & (n - 1))) {
+        log_error("lights: cannot cut a panorama into %d lights: expected a power of two from 1 "
+                  "to %d",
+                  n, LIGHTS_MAX);
+        return -EINVAL;
+    }
+    const int err = cutter_new(&k, p, &l, n);
+    if (!err) {
+        cut(&k, &(struct light_region){0, 0, k.width, k.height}, 0, n);
+        *out = l;
+    } else {
+        lights_free(&l);
+    }
+    cutter_free(&k);
+    return err;
+}
+
+// What one light for the whole region costs in accuracy: energy x (angle)^2.
+static double coarseness(const struct lights *l, int i)
+{
+    const double angle = l->spread_rad[i];
+    return (l->irradiance[i][0] + l->irradiance[i][1] + l->irradiance[i][2]) * angle * angle;
+}
+
+static void clear_light(struct lights *l, int i)
+{
+    memset(l->irradiance[i], 0, sizeof(l->irradiance[i]));
+    memset(l->dir_probe[i], 0, sizeof(l->dir_probe[i]));
+}
+
+int lights_refine(struct lights *out, const struct lights *from, const struct panorama *p, int n)
+{
+    struct lights l = {0};
+    struct cutter k;
+    int *next = malloc((size_t)(n + 1) * sizeof(*next)), n_made = from->n;
+    memset(out, 0, sizeof(*out));
+    int err = next ? cutter_new(&k, p, &l, n) : -ENOMEM;
+    if (!next)
+        return err;
+    for (int i = 0; !err && i < from->n; i++) {
+        memcpy(l.dir_probe[i], from->dir_probe[i], sizeof(l.dir_probe[i]));
+        memcpy(l.irradiance[i], from->irradiance[i], sizeof(l.irradiance[i]));
+        l.region[i] = from->region[i], l.spread_rad[i] = from->spread_rad[i], l.group[i] = i;
+        next[i] = i + 1 < from->n ? i + 1 : -1;
+    }
+    while (!err && n_made < n) {
+        int worst = 0;
+        struct light_region half[2];
+        for (int i = 1; i < n_made; i++)
+            if (coarseness(&l, i) > coarseness(&l, worst))
+                worst = i;
+        if (!(coarseness(&l, worst) > 0))
+            break;
+        if (!split(&k, &l.region[worst], half)) {
+            l.spread_rad[worst] = 0;
+            continue;
+        }
+        clear_light(&l, worst);
+        clear_light(&l, n_made);
+        measure(&k, worst, &half[0]);
+        measure(&k, n_made, &half[1]);
+        l.group[n_made] = l.group[worst];
+        next[n_made] = next[worst], next[worst] = n_made++;
+    }
+    if (!err)
+        err = lights_new(out, n_made);
+    if (!err) {
+        out->region = calloc((size_t)n_made, sizeof(*out->region));
+        out->spread_rad = calloc((size_t)n_made, sizeof(*out->spread_rad));
+        err = out->region && out->spread_rad ? 0 : -ENOMEM;
+    }
+    for (int i = 0, at = 0; !err && at >= 0; i++, at = next[at]) { // in the order of the groups
+        memcpy(out->dir_probe[i], l.dir_probe[at], sizeof(out->dir_probe[i]));
+        memcpy(out->irradiance[i], l.irradiance[at], sizeof(out->irradiance[i]));
+        out->region[i] = l.region[at], out->spread_rad[i] = l.spread_rad[at];
+        out->group[i] = l.group[at];
+        out->inverse_distance[i] = from->inverse_distance[l.group[at]];
+    }
+    if (!err) {
+        memcpy(out->centre_m, from->centre_m, sizeof(out->centre_m));
+        memcpy(out->world_from_probe, from->world_from_probe, sizeof(out->world_from_probe));
+        out->panorama_width_px = k.width, out->panorama_height_px = k.height;
+    } else {
+        lights_free(out);
+    }
     lights_free(&l);
-    return -ENOMEM;
+    cutter_free(&k);
+    free(next);
+    return err;
 }
 
 // ---- lights.json --------------------------------------------------------------------------------

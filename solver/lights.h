@@ -42,6 +42,11 @@ void lights_free(struct lights *l); // leaves it zeroed
 // the list are neighbours in the sky. 0, -EINVAL (n; logged), -ENOMEM.
 int lights_median_cut(struct lights *out, const struct panorama *p, int n);
 
+// Finer lights: of all regions, that whose one light is the coarsest (energy x spread^2) is split, until there are n (any number >=
+// from->n; fewer where nothing is left to split). group: which light of `from` each is a part of, ascending; the set-up
+// is from's, and every part has its light's distance. from: of lights_median_cut, of the same panorama. 0 or -ENOMEM.
+int lights_refine(struct lights *out, const struct lights *from, const struct panorama *p, int n);
+
 // lights.json (DESIGN.md 6): a list of {dir_probe[3], dir_world[3] (= R dh), irradiance[3],
 // distance_m and pos_m[3] (both null: directional), group (-1: none), and from a panorama
 // region_px[4] (x0, y0, x1, y1), panorama_px[2] (width, height) and spread_rad}. Lights without a

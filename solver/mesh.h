@@ -36,7 +36,7 @@ struct mesh_check {
 
 // Read a mesh and check it. check may be NULL. Errors, each logged with file, place, found, expected, remedy:
 // -errno of the open, -EINVAL (broken, truncated, no triangles, no UVs, NaN positions, an index out of range),
-// -ENOTSUP (format; a glTF extension such as Draco, or quantised attributes; UVs per face corner in PLY), -EFBIG (> 2^26
+// -ENOTSUP (format; a glTF extension such as Draco), -EFBIG (> 2^26
 // triangles), -ENOMEM.
 int mesh_read(struct mesh *out, struct mesh_check *check, const char *path);
 

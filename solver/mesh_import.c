@@ -16,6 +16,7 @@
 #include <assimp/scene.h>
 #include <errno.h>
 #include <inttypes.h>
+#include <locale.h>
 #include <stdarg.h>
 #include <stdlib.h>
 #include <string.h>
@@ -222,7 +223,8 @@ enum { PLY_MAX_ELEMENTS = 32, PLY_MAX_PROPERTIES = 128, PLY_ASCII = 0, PLY_LITTL
 
 struct ply_property {
     int size, list_size; // bytes of a value, and of a list's count (0: no list)
-    bool is_float, list_is_float, is_indices;
+    bool is_float, list_is_float, is_indices, is_texcoord;
+    char name[16];
 };
 struct ply_element {
     char name[32];
@@ -235,6 +237,7 @@ struct ply {
     int encoding;
     const char *at, *end;
     int n_elements;
+    bool has_texcoord; // UVs per corner of a face
     struct ply_element element[PLY_MAX_ELEMENTS];
 };
 
@@ -287,10 +290,12 @@ static int ply_property_line(struct ply *p, const char *at, const char *end, int
         return refuse(p->file, -EINVAL, "header line %d: a property without a name", line);
     if (!strcmp(e->name, "face") && q->list_size) {
         q->is_indices = word_is(word, n, "vertex_indices") || word_is(word, n, "vertex_index");
-        if (word_is(word, n, "texcoord"))
-            return refuse(p->file, -ENOTSUP, "header line %d: UVs per face corner (texcoord) are not read from PLY; export "
-                          "the mesh as OBJ or GLB", line);
+        q->is_texcoord = word_is(word, n, "texcoord");
+        if (q->is_texcoord && !q->is_float)
+            return refuse(p->file, -EINVAL, "header line %d: texcoord is of whole numbers; expected float", line);
+        p->has_texcoord = p->has_texcoord || q->is_texcoord;
     }
+    snprintf(q->name, sizeof(q->name), "%.*s", n < 15 ? (int)n : 15, word);
     e->n_properties++;
     return 0;
 }
@@ -368,6 +373,7 @@ static int ply_element_data(struct ply *p, const struct ply_element *e, uint64_t
 {
     uint64_t i = 0;
     for (; i < e->count; i++) {
+        int64_t n_corners = 0, n_texcoord = 0;
         for (int k = 0; k < e->n_properties; k++) {
             const struct ply_property *q = &e->property[k];
             int64_t n = 1, value;
@@ -376,6 +382,8 @@ static int ply_element_data(struct ply *p, const struct ply_element *e, uint64_t
             if (q->list_size && (n < 0 || n > p->end - p->at))
                 return refuse(p->file, -EINVAL, "%s %" PRIu64 ": a list of %" PRId64 " values; %td bytes follow", e->name, i,
                               n, p->end - p->at);
+            n_corners = q->is_indices ? n : n_corners;
+            n_texcoord = q->is_texcoord ? n : n_texcoord;
             if (q->is_indices && n < 3)
                 return refuse(p->file, -EINVAL, "face %" PRIu64 " has %" PRId64 " corners; expected 3 or more", i, n);
             for (int64_t j = 0; j < n; j++) {
@@ -386,6 +394,9 @@ static int ply_element_data(struct ply *p, const struct ply_element *e, uint64_t
                                   n_vertices);
             }
         }
+        if (n_texcoord && n_texcoord != 2 * n_corners)
+            return refuse(p->file, -EINVAL, "face %" PRIu64 " has %" PRId64 " numbers in texcoord; expected two for each of its %" PRId64
+                          " corners, or none", i, n_texcoord, n_corners);
     }
     return 0;
 cut_short:
@@ -418,6 +429,127 @@ static int check_ply(struct mesh_file *f)
         err = refuse(f, -EINVAL, "no faces: a point cloud; expected triangles");
     free(p);
     return err;
+}
+
+// A value as a number. Only after check_ply().
+static double ply_number(struct ply *p, const struct ply_property *q, locale_t c_locale)
+{
+    const char *before = p->at;
+    int64_t bits;
+    (void)ply_value(p, q->size, &bits);
+    if (p->encoding == PLY_ASCII)
+        return strtod_l(before, NULL, c_locale);
+    if (!q->is_float)
+        return (double)bits;
+    if (q->size == 4) {
+        const uint32_t low = (uint32_t)bits;
+        float value;
+        memcpy(&value, &low, sizeof(value));
+        return value;
+    }
+    double value;
+    memcpy(&value, &bits, sizeof(value));
+    return value;
+}
+
+// Corners are written as OBJ's v/vt/vn: assimp would give a vertex one UV, whatever its faces say.
+static void put_ply_face(FILE *out, struct ply *p, const struct ply_element *e, bool has_normals, uint64_t *n_uvs,
+                         locale_t c_locale)
+{
+    struct ply indices = { 0 }, texcoord = { 0 };
+    const struct ply_property *index = NULL, *uv = NULL;
+    int64_t n_corners = 0, n_texcoord = 0, ignored;
+    for (int k = 0; k < e->n_properties; k++) {
+        const struct ply_property *q = &e->property[k];
+        int64_t n = 1;
+        if (q->list_size)
+            (void)ply_value(p, q->list_size, &n);
+        if (q->is_indices)
+            index = q, n_corners = n, indices.at = p->at;
+        if (q->is_texcoord)
+            uv = q, n_texcoord = n, texcoord.at = p->at;
+        while (n-- > 0)
+            (void)ply_value(p, q->size, &ignored);
+    }
+    if (!index)
+        return;
+    indices.end = texcoord.end = p->end, indices.encoding = texcoord.encoding = p->encoding;
+    for (int64_t i = 0; uv && i < n_texcoord / 2; i++) {
+        const double u = ply_number(&texcoord, uv, c_locale), v = ply_number(&texcoord, uv, c_locale);
+        fprintf(out, "vt %.9g %.9g\n", u, v);
+    }
+    fprintf(out, "f");
+    for (int64_t i = 0; i < n_corners; i++) {
+        int64_t vertex;
+        (void)ply_value(&indices, index->size, &vertex);
+        fprintf(out, " %" PRId64, vertex + 1);
+        if (n_texcoord)
+            fprintf(out, "/%" PRIu64, *n_uvs + (uint64_t)i + 1);
+        if (has_normals)
+            fprintf(out, "%s/%" PRId64, n_texcoord ? "" : "/", vertex + 1);
+    }
+    fprintf(out, "\n");
+    *n_uvs += (uint64_t)n_texcoord / 2;
+}
+
+static char *ply_as_obj(const struct mesh_file *f, size_t *n_bytes)
+{
+    static const char *const wanted[6] = { "x", "y", "z", "nx", "ny", "nz" };
+    char *text = NULL;
+    uint64_t n_uvs = 0;
+    struct ply *p = calloc(1, sizeof(*p));
+    const locale_t c_locale = newlocale(LC_ALL_MASK, "C", (locale_t)0);
+    FILE *out = p && c_locale ? open_memstream(&text, n_bytes) : NULL;
+    bool has_normals = false;
+    if (!out)
+        goto done;
+    const locale_t before = uselocale(c_locale);
+    p->file = f, p->at = f->bytes, p->end = f->bytes + f->n_bytes;
+    (void)ply_header(p);
+    for (int i = 0; i < p->n_elements; i++) {
+        const struct ply_element *e = &p->element[i];
+        const bool is_vertex = !strcmp(e->name, "vertex"), is_face = !strcmp(e->name, "face");
+        int n_normal = 0;
+        for (int k = 0; k < e->n_properties && is_vertex; k++)
+            n_normal += e->property[k].name[0] == 'n' && strchr("xyz", e->property[k].name[1]) && !e->property[k].name[2];
+        has_normals = has_normals || n_normal == 3;
+        for (uint64_t row = 0; row < e->count; row++) {
+            if (is_face) {
+                put_ply_face(out, p, e, has_normals, &n_uvs, c_locale);
+                continue;
+            }
+            double value[6] = { 0 };
+            for (int k = 0; k < e->n_properties; k++) {
+                const struct ply_property *q = &e->property[k];
+                int64_t n = 1, ignored;
+                if (q->list_size)
+                    (void)ply_value(p, q->list_size, &n);
+                int place = -1;
+                for (int w = 0; w < 6 && is_vertex && !q->list_size; w++)
+                    place = strcmp(q->name, wanted[w]) ? place : w;
+                if (place >= 0)
+                    value[place] = ply_number(p, q, c_locale);
+                else
+                    while (n-- > 0)
+                        (void)ply_value(p, q->size, &ignored);
+            }
+            if (is_vertex)
+                fprintf(out, "v %.9g %.9g %.9g\n", value[0], value[1], value[2]);
+            if (is_vertex && n_normal == 3)
+                fprintf(out, "vn %.9g %.9g %.9g\n", value[3], value[4], value[5]);
+        }
+    }
+    uselocale(before);
+    const bool failed = ferror(out);
+    if (fclose(out) || failed) {
+        free(text);
+        text = NULL;
+    }
+done:
+    if (c_locale)
+        freelocale(c_locale);
+    free(p);
+    return text;
 }
 
 // ---- glTF ---------------------------------------------------------------------------------------------------------------
@@ -504,8 +636,8 @@ static int check_gltf_accessor(const struct mesh_file *f, const struct json *doc
     return 0;
 }
 
-// Positions, normals and UVs as 32-bit floats: assimp takes the bytes of other types for floats.
-static int check_gltf_attribute(const struct mesh_file *f, const struct json *doc, const char *primitive, const char *name,
+// Positions, normals and UVs: 32-bit floats, or (KHR_mesh_quantization) whole numbers of 8 or 16 bits.
+static int check_gltf_attribute(struct mesh_file *f, const struct json *doc, const char *primitive, const char *name,
                                 const char *type, bool needed)
 {
     char path[160];
@@ -519,9 +651,10 @@ static int check_gltf_attribute(const struct mesh_file *f, const struct json *do
     const int64_t component = gltf_int(doc, "accessors", accessor, "componentType", -1, 5126);
     snprintf(path, sizeof(path), "accessors.%" PRId64 ".type", accessor);
     (void)json_get_string(doc, path, &found);
-    if (component != 5126)
-        return refuse(f, -ENOTSUP, "%s: %s is quantised (component type %" PRId64 "); export it as 32-bit floats (5126)",
-                      primitive, name, component);
+    if (component > 5123 && component != 5126)
+        return refuse(f, -EINVAL, "%s: %s is of component type %" PRId64 "; expected 32-bit floats (5126), or 8 or 16 bits (5120 to "
+                      "5123)", primitive, name, component);
+    f->is_quantised = f->is_quantised || component != 5126;
     return strcmp(found, type) ? refuse(f, -EINVAL, "%s: %s is %s; expected %s", primitive, name, found, type) : 0;
 }
 
@@ -614,8 +747,7 @@ static void percent_decode(char *s)
     *out = 0;
 }
 
-// name in the folder of path, as it is or (where there is no such file) percent-decoded. NULL without memory.
-static char *path_beside(const char *path, const char *name)
+char *mesh_path_beside(const char *path, const char *name)
 {
     const char *slash = strrchr(path, '/');
     char *full;
@@ -642,7 +774,7 @@ static int check_gltf_buffer(const struct mesh_file *f, const struct json *doc, 
     }
     if (!strncmp(uri, "data:", 5))
         return 0;
-    char *full = path_beside(f->path, uri);
+    char *full = mesh_path_beside(f->path, uri);
     int err = full ? 0 : -ENOMEM;
     if (full && stat(full, &st))
         err = refuse(f, -EINVAL, "buffer %" PRId64 " is the file '%s': %s", i, full, strerror(errno));
@@ -738,6 +870,24 @@ static bool is_ply(const struct mesh_file *f)
     return f->n_bytes >= 4 && !memcmp(f->bytes, "ply", 3) && (f->bytes[3] == '\n' || f->bytes[3] == '\r');
 }
 
+static bool is_ply_with_corner_uvs(const struct mesh_file *f)
+{
+    static const char last[] = "end_header";
+    const char *end = is_ply(f) ? memmem(f->bytes, f->n_bytes, last, sizeof(last) - 1) : NULL;
+    for (const char *at = f->bytes, *word; end && at < end;) {
+        const char *line = at, *stop = memchr(at, '\n', (size_t)(end - at));
+        stop = stop ? stop : end;
+        size_t n = next_word(&line, stop, &word);
+        if (word_is(word, n, "property")) {
+            while ((n = next_word(&line, stop, &word)))
+                if (word_is(word, n, "texcoord"))
+                    return true;
+        }
+        at = stop + 1;
+    }
+    return false;
+}
+
 static bool is_gltf(const struct mesh_file *f)
 {
     const size_t at = n_blanks(f);
@@ -772,6 +922,7 @@ static const struct {
     bool has_buffers;                                             // may open files beside it
 } formats[] = {
     { "mesh.glb", is_glb, check_glb, NULL, true },
+    { "mesh.obj", is_ply_with_corner_uvs, check_ply, ply_as_obj, false },
     { "mesh.ply", is_ply, check_ply, NULL, false },
     { "mesh.gltf", is_gltf, check_gltf, NULL, true },
     { "mesh.obj", is_obj, check_obj, obj_with_leading_zeros, false },
@@ -850,7 +1001,7 @@ struct importing {
 
 static int read_beside(struct opened *o, const char *path, const char *name)
 {
-    char *full = path_beside(path, name);
+    char *full = mesh_path_beside(path, name);
     const int err = full ? file_read(&o->owned, &o->n_bytes, full, max_file_bytes) : -ENOMEM;
     if (err)
         log_error("mesh: %s: its buffer %s is needed: export the mesh again, or as one GLB", path, name);
@@ -1059,7 +1210,12 @@ static int import(struct soup *s, const struct mesh_file *f, int format)
     struct totals totals = { 0, 0 };
     struct adding adding = { s, f };
     char *rewritten = NULL;
-    if (formats[format].rewrite) {
+    if (f->is_quantised) {
+        err = mesh_gltf_floats(&rewritten, &shown.n_bytes, f);
+        if (err)
+            return err;
+        shown.bytes = rewritten;
+    } else if (formats[format].rewrite) {
         rewritten = formats[format].rewrite(f, &shown.n_bytes);
         if (!rewritten)
             return -ENOMEM;

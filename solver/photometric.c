@@ -90,6 +90,11 @@ void photometric_state_copy(const struct photometric *p, struct photometric_stat
     copy_state(p, to, from);
 }
 
+static double ratio_of(const struct photometric *p, int light)
+{
+    return p->ratio_of_light ? (double)p->ratio_of_light[light] : 1;
+}
+
 void photometric_pack(const struct photometric *p, const struct photometric_state *s, double *x)
 {
     const struct photometric_layout l = layout_of(p);
@@ -99,7 +104,7 @@ void photometric_pack(const struct photometric *p, const struct photometric_stat
     memcpy(x + l.albedo, s->shared_albedo, sizeof(s->shared_albedo));
     memcpy(x + l.gain, s->log_gain, (size_t)l.n_views * sizeof(double));
     for (int i = 0; i < s->lights.n; i++)
-        x[l.inverse_distance + p->group_of_light[i]] = s->lights.inverse_distance[i];
+        x[l.inverse_distance + p->group_of_light[i]] = s->lights.inverse_distance[i] / ratio_of(p, i);
 }
 
 void photometric_unpack(const struct photometric *p, struct photometric_state *s, const double *x)
@@ -113,7 +118,7 @@ void photometric_unpack(const struct photometric *p, struct photometric_state *s
     memcpy(s->shared_albedo, x + l.albedo, sizeof(s->shared_albedo));
     memcpy(s->log_gain, x + l.gain, (size_t)l.n_views * sizeof(double));
     for (int i = 0; i < s->lights.n; i++)
-        s->lights.inverse_distance[i] = x[l.inverse_distance + p->group_of_light[i]];
+        s->lights.inverse_distance[i] = x[l.inverse_distance + p->group_of_light[i]] * ratio_of(p, i);
 }
 
 double photometric_rmse_percent(const struct photometric_error *e)
@@ -149,7 +154,7 @@ struct job {
     int n_workers;
     bool fit;
     int n_free, *column;          // the compact place of each unknown, -1: not free
-    int run;                      // lights per group when groups are aligned runs of so many and all are free; else 0
+    int *group_first;             // [n_groups + 1] where the lights of each group begin, when they are ascending and all groups are free; else NULL
     bool tinted;                  // the tint matters: solve the albedo twice
     float (*residual)[3];         // [samples n] for the scale and the robust weights, or NULL
 };
@@ -167,6 +172,7 @@ static void job_free(struct job *j)
     }
     free(j->workers);
     free(j->column);
+    free(j->group_first);
     light_arrays_free(&j->lights);
 }
 
@@ -189,10 +195,20 @@ static int job_new(struct job *j, const struct photometric *p, struct photometri
         j->column[i] = is_free[i] ? j->n_free++ : -1;
     if (!j->column)
         goto fail;
-    j->run = s->lights.n / p->n_groups; // 0 where groups are more than lights
-    for (int i = 0; j->run && i < s->lights.n; i++)
-        if (!is_free || p->group_of_light[i] != i / j->run || j->column[j->layout.inverse_distance + i / j->run] < 0)
-            j->run = 0;
+    bool ascending = is_free;
+    for (int i = 0; ascending && i < s->lights.n; i++)
+        ascending = (i == 0 || p->group_of_light[i] >= p->group_of_light[i - 1]);
+    for (int g = 0; ascending && g < p->n_groups; g++)
+        ascending = j->column[j->layout.inverse_distance + g] >= 0;
+    if (ascending) {
+        if (!(j->group_first = calloc((size_t)p->n_groups + 1, sizeof(int))))
+            goto fail;
+        for (int i = 0; i < s->lights.n; i++)
+            j->group_first[p->group_of_light[i] + 1] = i + 1;
+        for (int g = 0; g < p->n_groups; g++) // a group without lights begins and ends where the one before ends
+            if (j->group_first[g + 1] < j->group_first[g])
+                j->group_first[g + 1] = j->group_first[g];
+    }
     for (int i = 0; j->workers && i < j->n_workers; i++) {
         struct worker *w = &j->workers[i];
         w->seen = malloc(MAX_VIEWS_PER_TEXEL * sizeof(*w->seen));
@@ -395,21 +411,19 @@ static void put(const struct job *j, float *row, int unknown, float value)
         row[j->column[unknown]] += value;
 }
 
-VECTOR_CLONES static void add_runs(float *restrict row, const float *restrict by_light, int n_groups, int run, float scale)
+VECTOR_CLONES static void add_groups(float *restrict row, const float *restrict by_light, const float *restrict ratio,
+                                     const int *restrict first, int n_groups, int n_lights, float scale)
 {
-    if (run == 1) {
+    if (n_lights == n_groups && !ratio && first[n_groups - 1] == n_groups - 1) { // one each
         for (int g = 0; g < n_groups; g++)
             row[g] += scale * by_light[g];
-    } else if (run == 4) {
-        for (int g = 0; g < n_groups; g++)
-            row[g] += scale * (by_light[4 * g] + by_light[4 * g + 1] + by_light[4 * g + 2] + by_light[4 * g + 3]);
-    } else {
-        for (int g = 0; g < n_groups; g++) {
-            float sum = 0;
-            for (int i = g * run; i < (g + 1) * run; i++)
-                sum += by_light[i];
-            row[g] += scale * sum;
-        }
+        return;
+    }
+    for (int g = 0; g < n_groups; g++) {
+        float sum = 0;
+        for (int i = first[g]; i < first[g + 1]; i++)
+            sum += ratio ? ratio[i] * by_light[i] : by_light[i];
+        row[g] += scale * sum;
     }
 }
 
@@ -427,12 +441,14 @@ static void fill_row(const struct job *j, float *row, int c, int view, float sca
         put(j, row, l->albedo + i, scale * d->albedo[c][i]);
     }
     put(j, row, l->gain + view, scale * d->L[c]);
-    if (j->run) {
-        add_runs(row + j->column[l->inverse_distance], setup->inverse_distance[c], l->n_groups, j->run, scale);
+    if (j->group_first) {
+        add_groups(row + j->column[l->inverse_distance], setup->inverse_distance[c], j->p->ratio_of_light, j->group_first, l->n_groups,
+                   j->lights.n, scale);
         return;
     }
     for (int i = 0; i < j->lights.n; i++)
-        put(j, row, l->inverse_distance + j->p->group_of_light[i], scale * setup->inverse_distance[c][i]);
+        put(j, row, l->inverse_distance + j->p->group_of_light[i],
+            scale * (float)ratio_of(j->p, i) * setup->inverse_distance[c][i]);
 }
 
 // Remove from the texel's rows of one channel what a change of its albedo would explain.

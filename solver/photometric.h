@@ -15,7 +15,7 @@ enum albedo_mode {
     ALBEDO_SHARED, // one unknown colour for all
 };
 
-// Lights in the kernel may be finer than the unknown distances: light i's 1/r is that of its group.
+// Lights in the kernel may be finer than the unknown distances: light i's 1/r is that of its group times its ratio.
 struct photometric_layout {
     int n;                 // unknowns in all
     int theta, centre, rotation, albedo, gain, inverse_distance; // where each begins
@@ -30,6 +30,7 @@ struct photometric {
     enum disney_variant variant;
     enum albedo_mode albedo;
     const int32_t *group_of_light;  // [lights n]
+    const float *ratio_of_light;    // [lights n] a light's 1/r over its group's (a tilted panel); NULL: 1
     int n_groups;
     const uint8_t *use_view;        // [n_views] 0: left out; NULL: all
     int texel_step;                 // only every so many texels (1: all): a coarse look costs less

@@ -33,7 +33,7 @@ static const double GRADIENT_STEP_PX = .5;
 struct samples_settings samples_defaults(void)
 {
     return (struct samples_settings){
-        .grazing_cos = MASK_GRAZING_COS_PERCENT / 100., .erode_px = 1, .white = 1};
+        .grazing_cos = MASK_GRAZING_COS_PERCENT / 100., .erode_px = 1, .at_centre = true, .white = 1};
 }
 
 // ---- where a texel lies in a view -----------------------------------------------------------
@@ -68,10 +68,11 @@ static double half_side(double spread_px)
 
 // A texel is a square of texel_size_m on the surface, a parallelogram in the picture; the box has
 // its spread along x and y. A box of one pixel is bilinear interpolation. False: the box, or those
-// that the gradient compares, leave the picture.
+// that are compared with it, leave the picture.
 static bool footprint_of(struct footprint *f, const struct texels *t, int64_t i,
-                         const struct camera *camera)
+                         const struct camera *camera, bool at_centre)
 {
+    const double margin_px = at_centre ? 1 : GRADIENT_STEP_PX;
     double point[3], tangent[3], bitangent[3], normal[3], uv_px[2], J[6], M[4];
     for (int c = 0; c < 3; c++) {
         point[c] = (double)t->position_m[i][c];
@@ -87,8 +88,7 @@ static bool footprint_of(struct footprint *f, const struct texels *t, int64_t i,
     f->u_px = uv_px[0], f->v_px = uv_px[1];
     f->half_width_px = half_side(length_of(M[0], M[1]));
     f->half_height_px = half_side(length_of(M[2], M[3]));
-    const double x_reach = f->half_width_px + GRADIENT_STEP_PX,
-                 y_reach = f->half_height_px + GRADIENT_STEP_PX;
+    const double x_reach = f->half_width_px + margin_px, y_reach = f->half_height_px + margin_px;
     if (!(f->u_px >= x_reach && f->u_px <= camera->width_px - x_reach && f->v_px >= y_reach &&
           f->v_px <= camera->height_px - y_reach))
         return false;
@@ -140,7 +140,7 @@ static void want_pixels(void *arg, int64_t begin, int64_t end, int worker)
         struct footprint f;
         if (job->mask[i] != MASK_VISIBLE)
             continue;
-        if (!footprint_of(&f, job->texels, i, job->camera)) {
+        if (!footprint_of(&f, job->texels, i, job->camera, job->settings->at_centre)) {
             job->mask[i] = MASK_OUTSIDE;
             continue;
         }
@@ -204,6 +204,18 @@ static const float *pixel_at(const struct image *image, int x, int y)
     return image->data + ((size_t)y * (size_t)image->width + (size_t)x) * (size_t)image->n_channels;
 }
 
+// How far what mean_over() weighs lies from the footprint's centre on average, and the mean square of that, along one axis. A
+// pixel is itself the mean over its area, which adds 1/12.
+static void moments_of(double *first, double *second, double centre_px, double half_px)
+{
+    const double a = centre_px - half_px, b = centre_px + half_px;
+    *first = 0, *second = 1. / 12;
+    for (int x = (int)a; x < b; x++) {
+        const double share = (lesser(x + 1, b) - greater(x, a)) / (b - a), off = x + .5 - centre_px;
+        *first += share * off, *second += share * off * off;
+    }
+}
+
 // The mean over the footprint moved by (dx, dy): every pixel by the area it shares with the box.
 static void mean_over(double rgb[3], const struct view_job *job, const struct footprint *f,
                       double dx_px, double dy_px)
@@ -226,6 +238,30 @@ static void mean_over(double rgb[3], const struct view_job *job, const struct fo
     }
     for (int c = 0; c < 3; c++)
         rgb[c] /= (x1 - x0) * (y1 - y0);
+}
+
+// The value at the footprint's centre of a radiance that is quadratic there: the mean over the footprint less what slope and
+// curvature, from the footprints a pixel away, add to it. Less of that for wide footprints: it would let sharp edges ring, and noise in.
+static void value_at_centre(double rgb[3], const struct view_job *job, const struct footprint *f)
+{
+    double mean[3], at[4][3];
+    mean_over(mean, job, f, 0, 0);
+    mean_over(at[0], job, f, -1, 0);
+    mean_over(at[1], job, f, 1, 0);
+    mean_over(at[2], job, f, 0, -1);
+    mean_over(at[3], job, f, 0, 1);
+    double first[2], second[2], share[2];
+    share[0] = lesser(1, 1 / (f->half_width_px * f->half_width_px));
+    share[1] = lesser(1, 1 / (f->half_height_px * f->half_height_px));
+    moments_of(&first[0], &second[0], f->u_px, f->half_width_px);
+    moments_of(&first[1], &second[1], f->v_px, f->half_height_px);
+    for (int c = 0; c < 3; c++) {
+        rgb[c] = mean[c];
+        for (int axis = 0; axis < 2; axis++) {
+            const double before = at[2 * axis][c], after = at[2 * axis + 1][c];
+            rgb[c] -= first[axis] * (after - before) / 2 + share[axis] * second[axis] * (after - 2 * mean[c] + before) / 2;
+        }
+    }
 }
 
 static double luminance_at(const struct view_job *job, const struct footprint *f, double dx_px,
@@ -258,7 +294,7 @@ static void read_texels(void *arg, int64_t begin, int64_t end, int worker)
         struct footprint f;
         if (job->mask[i] != MASK_VISIBLE)
             continue;
-        if (!footprint_of(&f, job->texels, i, job->camera) || !sees_only_its_surface(job, i, &f)) {
+        if (!footprint_of(&f, job->texels, i, job->camera, job->settings->at_centre) || !sees_only_its_surface(job, i, &f)) {
             job->mask[i] = MASK_OCCLUDED;
             continue;
         }
@@ -266,7 +302,10 @@ static void read_texels(void *arg, int64_t begin, int64_t end, int worker)
         const double step = GRADIENT_STEP_PX;
         const double across = luminance_at(job, &f, step, 0) - luminance_at(job, &f, -step, 0),
                      down = luminance_at(job, &f, 0, step) - luminance_at(job, &f, 0, -step);
-        mean_over(rgb, job, &f, 0, 0);
+        if (job->settings->at_centre && job->settings->erode_px > 0)
+            value_at_centre(rgb, job, &f);
+        else
+            mean_over(rgb, job, &f, 0, 0);
         for (int c = 0; c < 3; c++)
             job->value[i][c] = half_from_float((float)rgb[c]);
         job->value[i][3] = half_from_float((float)(length_of(across, down) / (2 * step)));

@@ -7,6 +7,7 @@
 #include "solver/cameras.h"
 #include "solver/rays.h"
 #include "solver/texels.h"
+#include <stdbool.h>
 #include <stdint.h>
 
 enum sample_flags {
@@ -31,6 +32,8 @@ struct samples_settings {
     double grazing_cos; // samples below are left out; .15 (SOLVER.md 2)
     int erode_px;       // samples this near (in pixels) to a silhouette or depth edge are left out; 1. Counted from the pixels a
                         // sample reads: 1 makes sure that no pixel that is read lies on the edge itself; 0 looks at their centres only
+    bool at_centre;     // take off what slope and curvature of the picture add to the mean over a footprint, as from a pixel around it
+                        // (which erode_px >= 1 makes sure is the same surface): the radiance at the texel's centre, to second order; true
     double white;       // clip level where an image has no "clip" channel; 1.0; 0: never
     int n_threads;
 };
@@ -39,7 +42,7 @@ struct samples_settings samples_defaults(void);
 // Project every texel into every view (image_paths[k] belongs to cameras->view[k]; NULL: the view is skipped), test visibility with
 // rays, and read the radiance: the mean over a box as wide and high as the projected texel is spread along x and y, each side
 // 1 to 8 px (1: bilinear interpolation). Left out: what visibility_camera_mask() does not call visible; boxes within half a
-// pixel of the picture's border; and those that read, or have within erode_px around what they read, a pixel whose ray (through its centre)
+// pixel (at_centre: one) of the picture's border; and those that read, or have within erode_px around what they read, a pixel whose ray (through its centre)
 // misses the mesh or meets it further off the texel's tangent plane than 4 texels plus a quarter of the distance along it.
 // Images of another size than the camera says are accepted when the aspect matches (the camera is resized), else refused; so
 // are views without R, G or B, and those with a pixel (R, G, B, clip) that is not finite: by name. At most 65,536 views.

@@ -26,7 +26,7 @@ struct neighbour_pair {
 static int find_pairs(struct stage1 *s, const struct lights *l)
 {
     const int n = s->p.n_groups;
-    double(*d)[3] = calloc((size_t)n, sizeof(*d));
+    double(*d)[3] = s->group_dir = calloc((size_t)n, sizeof(*d));
     unsigned char *lit = calloc((size_t)n, 1);
     s->pairs = malloc((size_t)n * N_NEIGHBOURS * sizeof(*s->pairs));
     int err = d && lit && s->pairs ? 0 : -ENOMEM;
@@ -58,7 +58,6 @@ static int find_pairs(struct stage1 *s, const struct lights *l)
         for (int k = 0; k < m; k++) // each direction of a neighbourhood counts, as in Eq. 11
             s->pairs[s->n_pairs++] = (struct neighbour_pair){ g, nearest[k], 1 / fmax(distance2[k], 1e-6) };
     }
-    free(d);
     free(lit);
     return err;
 }
@@ -74,13 +73,15 @@ static double similarity_of(const struct stage1 *s, double x, double *slope)
     return log(x);
 }
 
-// Eq. 11, and for joint the first guess of the centre.
+// Eq. 11 or, between lights on planes, these; and for joint the first guess of the centre.
 static double add_similarity(const struct stage1 *s, const double *x, double *A, double *g)
 {
     const int first = s->layout.inverse_distance, n = s->layout.n;
     double cost = 0;
     for (int k = 0; s->w_sim > 0 && k < s->n_pairs; k++) {
         const int i = first + s->pairs[k].i, j = first + s->pairs[k].j;
+        if (s->emitters.n && s->emitters.of[i - first] >= 0 && s->emitters.of[j - first] >= 0)
+            continue; // their planes say more
         double si, sj;
         const double w = s->w_sim * s->pairs[k].weight;
         const double e = similarity_of(s, x[i], &si) - similarity_of(s, x[j], &sj);
@@ -91,6 +92,9 @@ static double add_similarity(const struct stage1 *s, const double *x, double *A,
         A[(size_t)i * n + i] += w * si * si, A[(size_t)j * n + j] += w * sj * sj;
         A[(size_t)(i > j ? i : j) * n + (i > j ? j : i)] -= w * si * sj;
     }
+    if (s->emitters.n)
+        cost += emitters_add_cost(&s->emitters, s->p.n_groups, (const double(*)[3])s->group_dir, x + first, s->plane_scale, s->w_plane, n,
+                                  first, A, g);
     for (int c = 0; s->set->method == METHOD_JOINT && c < 3; c++) {
         const int i = s->layout.centre + c;
         const double w = s->w_sim / (centre_guess_m * centre_guess_m), e = x[i] - s->first_centre_m[c];
@@ -246,6 +250,27 @@ static void set_bounds(struct stage1 *s)
     }
 }
 
+void stage1_set_planes(struct stage1 *s, struct emitters *e, double w_plane)
+{
+    photometric_pack(&s->p, &s->base, s->x);
+    const double *q = s->x + s->layout.inverse_distance;
+    emitters_free(&s->emitters);
+    s->emitters = *e;
+    memset(e, 0, sizeof(*e));
+    s->w_plane = w_plane;
+    for (int g = 0; g < s->p.n_groups; g++)
+        s->plane_scale[g] = q[g];
+    s->p.ratio_of_light = s->ratio;
+    for (int i = 0; i < s->base.lights.n; i++) {
+        const int g = s->p.group_of_light[i], k = s->emitters.n ? s->emitters.of[g] : -1;
+        const double *m = k < 0 ? NULL : s->emitters.plane[k];
+        s->ratio[i] = 1;
+        if (m)
+            s->ratio[i] = (float)fmin(fmax(vec3_dot(m, s->base.lights.dir_probe[i]) / vec3_dot(m, s->group_dir[g]), .5), 2);
+        s->base.lights.inverse_distance[i] = q[g] * (double)s->ratio[i];
+    }
+}
+
 int stage1_trace_visibility(struct stage1 *s)
 {
     if (!s->set->visibility || !s->rays)
@@ -306,10 +331,12 @@ int stage1_new(struct stage1 *s, const struct photometric *p, const struct light
     memcpy(s->first_centre_m, lights->centre_m, sizeof(s->first_centre_m));
     const size_t n = (size_t)s->layout.n;
     s->is_free = calloc(n, 1);
+    s->ratio = calloc((size_t)lights->n, sizeof(float));
+    s->plane_scale = calloc((size_t)p->n_groups, sizeof(double));
     s->x = calloc(n, sizeof(double));
     s->lower = calloc(n, sizeof(double));
     s->upper = calloc(n, sizeof(double));
-    if (!s->is_free || !s->x || !s->lower || !s->upper)
+    if (!s->is_free || !s->ratio || !s->plane_scale || !s->x || !s->lower || !s->upper)
         return -ENOMEM;
     int err = photometric_state_new(&s->base, p, lights);
     if (!err)
@@ -341,6 +368,10 @@ void stage1_free(struct stage1 *s)
     photometric_state_free(&s->base);
     photometric_state_free(&s->trial);
     light_visibility_free(&s->visibility);
+    emitters_free(&s->emitters);
+    free(s->plane_scale);
+    free(s->ratio);
+    free(s->group_dir);
     free(s->pairs);
     free(s->is_free);
     free(s->x);

@@ -2,6 +2,7 @@
 // distances, minimised by lm.h. Shared by the methods of joint.h; nobody else includes it. The methods differ in what they
 // make free, in the samples they weigh (p.weight, p.use_view, p.texel_step may be changed between two calls) and in the order of calls.
 #pragma once
+#include "solver/emitters.h"
 #include "solver/joint.h"
 #include "solver/visibility.h"
 
@@ -12,6 +13,10 @@ struct stage1 {
     struct photometric_state base, trial; // where the search stands, and what it tries
     struct neighbour_pair *pairs;         // of E_sim
     int n_pairs;
+    double (*group_dir)[3];               // [groups] energy-weighted, in the probe frame
+    struct emitters emitters;             // planes that hold groups together, with w_plane beside the mean of squares
+    double w_plane, *plane_scale;         // [groups] 1/r that deviations are relative to
+    float *ratio;                         // [lights] of p.ratio_of_light
     bool in_distance;         // the unknown is r, not 1/r, and E_sim is Eq. 11 to the letter (paper)
     double w_sim;             // beside the mean of squares
     double first_centre_m[3]; // joint: the centre is held near its first guess with the same weight, which ends at (nearly) 0
@@ -30,6 +35,9 @@ int stage1_new(struct stage1 *s, const struct photometric *p, const struct light
 void stage1_free(struct stage1 *s);
 
 void stage1_set_distances(struct stage1 *s, double distance_m); // of all lights; 0: infinite
+// Holds the lights of each plane on it (tilt and all: finer lights of one group follow the plane) by w_plane; takes over e (zeroed after).
+// Planes of an earlier call are forgotten; e->n = 0: none.
+void stage1_set_planes(struct stage1 *s, struct emitters *e, double w_plane);
 // Traces shadows when settings ask for them; later calls only the lights that have moved by more than .5 degrees.
 int stage1_trace_visibility(struct stage1 *s);
 // From base to base. cost may be NULL. 0 or -errno.

@@ -34,6 +34,7 @@ only_in libtiff 'tiff' solver/take/image_tiff.c
 only_in libpng 'png\.h' solver/take/image_png.c
 only_in jansson 'jansson' solver/take/json.c
 only_in assimp 'assimp' solver/mesh_import.c
+only_in expat 'expat' solver/xml.c
 only_in Embree 'embree' solver/rays.c
 only_in LibRaw 'libraw' rigd/develop.c
 only_in libgphoto2 'gphoto2' rigd/camera_gphoto.c

@@ -11,7 +11,7 @@
 // rays, weighted by luminance x solid angle; of a light without a region, that of the ray R* dh.
 // Light that comes from no rectangle, or from behind one, has no true distance: a light with less
 // than half of its energy from rectangles is counted as off the panels and left out. Where
-// the report has n_sub_lights, each aligned run of so many is one light of all their regions: what
+// the report has n_sub_lights > 1, neighbours of one group are one light of all their regions: what
 // a solver splits is judged as what it did not split.
 #pragma once
 #include "solver/disney.h"
@@ -259,15 +259,17 @@ static inline int judge_lights(struct judgement *out, const struct judge_truth *
     int n = 0;
     if (!error)
         return -ENOMEM;
-    for (int i = 0; i < l->n; i += n_sub) {
+    for (int i = 0, end; i < l->n; i = end) {
         struct judge_seen seen = {0};
-        const double q = l->inverse_distance[i];
-        double weight = 0, dir[3] = {0}, here[3], there[3], off[3];
-        for (int k = i; k < i + n_sub; k++) {
+        double weight = 0, q = 0, dir[3] = {0}, here[3], there[3], off[3];
+        for (end = i + 1; n_sub > 1 && end < l->n && l->group[i] >= 0 && l->group[end] == l->group[i];)
+            end++;
+        for (int k = i; k < end; k++) {
             const double luminance = judge_light_luminance(l, k);
             if (luminance <= 0)
                 continue;
             weight += luminance;
+            q += luminance * l->inverse_distance[k];
             vec3_add_scaled(dir, dir, luminance, l->dir_probe[k]);
             judge_add_light(&seen, t, p, l, k);
         }
@@ -277,6 +279,7 @@ static inline int judge_lights(struct judgement *out, const struct judge_truth *
             out->n_off_panels++;
             continue;
         }
+        q /= weight;
         const double q_true = seen.sum / seen.met, relative = fabs(1 / q - 1 / q_true) * q_true;
         if (n_sub > 1)
             vec3_normalise(dir);
@@ -355,7 +358,7 @@ static inline int judge_set_up(struct judgement *out, const struct judge_truth *
     }
     int64_t n_sub = 1;
     json_get_int(report, "n_sub_lights", &n_sub);
-    if (n_sub < 1 || n_sub > l.n || l.n % n_sub) {
+    if (n_sub < 1 || n_sub > l.n) {
         log_error("judge: %s: report.json: n_sub_lights is %lld, of %d lights", solve,
                   (long long)n_sub, l.n);
         err = -EINVAL;

@@ -113,8 +113,25 @@ printf 'n_x,n_y\n1,0\n' >"$dir/cases.csv"
 refuses "a table of cases without its columns is refused" 'cases\.csv.*column' "$rigsolve" brdf "$dir/cases.csv"
 mkdir -p "$dir/away" && sed -E '/^#/!{/^[0-9]/s/^([0-9]+ [^ ]+ [^ ]+ [^ ]+ [^ ]+) [^ ]+ [^ ]+ [^ ]+/\1 0 0 -500/}' "$cameras/images.txt" >"$dir/away/images.txt"
 cp "$cameras/cameras.txt" "$cameras/points3D.txt" "$dir/away"
-gives 3 "cameras that do not see the mesh: done, but not to be trusted" "$rigsolve" visibility --mesh "$dir/one/geometry/mesh.obj" \
-    --cameras "$dir/away" -o "$dir/away/out" --texture 32
+refuses "cameras that do not see the mesh are refused with every hit rate" 'does not see.*as it is 0\.0%.*mirrored' \
+    vis "$dir/one/geometry/mesh.obj" "$dir/away"
+
+# The same take with another tool's cameras: Bundler's, whose names and sizes come from elsewhere
+cp -r "$dir/one" "$dir/bundler" && rm -r "$dir/bundler/geometry/cameras"
+perl -e 'open C, "$ARGV[0]/cameras.txt"; open I, "$ARGV[0]/images.txt"; for (<C>) { next if /^#/; @c = split; $f{$c[0]} = $c[4]; }
+    for (<I>) { next if /^#/ or !/\S/; ($id, $w, $x, $y, $z, @t[0..2], $c, $n) = split; push @n, $n;
+        @R = (1-2*($y*$y+$z*$z), 2*($x*$y-$w*$z), 2*($x*$z+$w*$y), 2*($x*$y+$w*$z), 1-2*($x*$x+$z*$z), 2*($y*$z-$w*$x),
+              2*($x*$z-$w*$y), 2*($y*$z+$w*$x), 1-2*($x*$x+$y*$y));
+        $o .= "$f{$c} 0 0\n@R[0..2]\n".join(" ", map -$_, @R[3..5])."\n".join(" ", map -$_, @R[6..8])."\n$t[0] ".-$t[1]." ".-$t[2]."\n"; }
+    open O, ">$ARGV[1]/bundle.out"; print O "# Bundle file v0.3\n".@n." 0\n$o"; open O, ">$ARGV[1]/list.txt"; print O "$_\n" for @n;' \
+    "$cameras" "$dir/bundler/geometry"
+gives 0 "visibility of a take" "$rigsolve" visibility "$dir/one" -o "$dir/seen1" --texture 32 --lights 4
+gives 0 "visibility of the same take with Bundler's cameras" "$rigsolve" visibility "$dir/bundler" -o "$dir/seen2" --texture 32 --lights 4
+sums "$dir/seen1" | cut -d' ' -f1,2 >"$dir/sums1" && sums "$dir/seen2" | cut -d' ' -f1,2 >"$dir/sums2" && [ -s "$dir/sums1" ] &&
+    cmp "$dir/sums1" "$dir/sums2" >"$dir/log" 2>&1
+result $? "cameras from another tool's file, the same visibility"
+refuses "Bundler without its list is refused by name" 'list\.txt' vis "$dir/one/geometry/mesh.obj" "$(mkdir -p "$dir/nolist" &&
+    cp "$dir/bundler/geometry/bundle.out" "$dir/nolist" && echo "$dir/nolist")"
 
 # A writer that is killed leaves nothing under the final name
 "$rigsolve" synth D3 -o "$dir/killed" --size 600x400 --true-lights 4096 >/dev/null 2>&1 &

@@ -306,7 +306,7 @@ static void sub_lights_are_judged_as_one(void **state)
         memcpy(cut.centre_m, k.centre_m, sizeof(cut.centre_m));
         memcpy(cut.world_from_probe, k.world_from_probe, sizeof(cut.world_from_probe));
         for (int i = 0; i < cut.n; i++)
-            cut.inverse_distance[i] = 1 / (1 + .02 * (i / n_sub));
+            cut.inverse_distance[i] = 1 / (1 + .02 * (i / n_sub)), cut.group[i] = i / n_sub;
         json_set_int(k.report, "n_sub_lights", n_sub);
         lights_free(&k.lights);
         k.lights = cut;

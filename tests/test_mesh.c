@@ -226,6 +226,139 @@ static void every_format_gives_the_same_uvs(void **state)
     setlocale(LC_ALL, no_locale);
 }
 
+// The quad as gltfpack leaves it: positions in 16 bits, scaled by their node; UVs in 16 bits, normalised, or 8; normals in 8; strides
+// padded to 4 bytes. Once as GLB, once with its buffer beside, once with its buffer inside the text.
+static void quantised_gltf_is_read(void **state)
+{
+    (void)state;
+    static const char format[] = "{\"asset\":{\"version\":\"2.0\"},\"extensionsRequired\":[\"KHR_mesh_quantization\"],\"extensionsUsed\":"
+        "[\"KHR_mesh_quantization\"],\"scene\":0,\"scenes\":[{\"nodes\":[0]}],\"nodes\":[{\"mesh\":0,\"scale\":[0.5,0.25,1],"
+        "\"translation\":[1,0.5,0]}],\"meshes\":[{\"primitives\":[{\"attributes\":{\"POSITION\":0,\"TEXCOORD_0\":1,\"NORMAL\":2},"
+        "\"indices\":3}]}],\"accessors\":[{\"bufferView\":0,\"componentType\":5122,\"count\":4,\"type\":\"VEC3\"},"
+        "{\"bufferView\":1,\"componentType\":5121,\"normalized\":true,\"count\":4,\"type\":\"VEC2\"},"
+        "{\"bufferView\":2,\"componentType\":5120,\"normalized\":true,\"count\":4,\"type\":\"VEC3\"},"
+        "{\"bufferView\":3,\"componentType\":5123,\"count\":6,\"type\":\"SCALAR\"}],\"bufferViews\":["
+        "{\"buffer\":0,\"byteLength\":32,\"byteStride\":8},{\"buffer\":0,\"byteOffset\":32,\"byteLength\":16,\"byteStride\":4},"
+        "{\"buffer\":0,\"byteOffset\":48,\"byteLength\":16,\"byteStride\":4},{\"buffer\":0,\"byteOffset\":64,\"byteLength\":12}],"
+        "\"buffers\":[{%s\"byteLength\":76}]}";
+    static const int16_t corner[4][4] = { { -2, -2, 0, 99 }, { 2, -2, 0, 99 }, { 2, 2, 0, 99 }, { -2, 2, 0, 99 } };
+    static const unsigned char uv[4][4] = { { 51, 204, 99, 99 }, { 255, 204, 99, 99 }, { 255, 0, 99, 99 }, { 51, 0, 99, 99 } };
+    static const signed char normal[4] = { 0, 0, 127, 99 };
+    static const uint16_t indices[6] = { 0, 1, 2, 0, 2, 3 };
+    static const char digits[] = "ABCDEFGHIJKLMNOPQRSTUVWXYZabcdefghijklmnopqrstuvwxyz0123456789+/";
+    unsigned char buffer[78] = { 0 }, bytes[4096];
+    char json[3000], uri[200] = "\"uri\":\"data:;base64,";
+    memcpy(buffer, corner, 32);
+    memcpy(buffer + 32, uv, 16);
+    for (int i = 0; i < 4; i++)
+        memcpy(buffer + 48 + 4 * i, normal, 4);
+    memcpy(buffer + 64, indices, 12);
+    size_t n_uri = strlen(uri);
+    for (size_t i = 0; i < 76; i += 3)
+        for (size_t k = 0; k < 4; k++)
+            uri[n_uri++] = i + k > 76 ? '=' : digits[((unsigned)buffer[i] << 16 | (unsigned)buffer[i + 1] << 8 | buffer[i + 2]) >> (18 - 6 * k) & 63];
+    strcpy(uri + n_uri, "\",");
+    for (int variant = 0; variant < 3; variant++) {
+        struct mesh m;
+        struct mesh_check check;
+        int err;
+        snprintf(json, sizeof(json), format, variant == 0 ? "" : variant == 1 ? "\"uri\":\"the%20quad.bin\"," : uri);
+        scratch_write("the quad.bin", buffer, 76);
+        if (variant == 0) {
+            const size_t n = strlen(json), n_json = (n + 3) / 4 * 4;
+            memcpy(bytes, "glTF\2\0\0\0", 8);
+            put_u32(bytes + 8, (uint32_t)(20 + n_json + 8 + 76));
+            put_u32(bytes + 12, (uint32_t)n_json);
+            memcpy(bytes + 16, "JSON", 4);
+            memset(bytes + 20, ' ', n_json);
+            memcpy(bytes + 20, json, n);
+            put_u32(bytes + 20 + n_json, 76);
+            memcpy(bytes + 24 + n_json, "BIN", 4);
+            memcpy(bytes + 28 + n_json, buffer, 76);
+            err = read_bytes(&m, &check, "quad.glb", bytes, 28 + n_json + 76);
+        } else {
+            err = read_text(&m, &check, "quad.gltf", json);
+        }
+        if (err)
+            fail_msg("variant %d: %d %s", variant, err, errors);
+        assert_true(m.n_triangles == 2 && m.n_vertices == 4 && m.n_points == 4 && m.n_charts == 1);
+        for (int i = 0; i < 6; i++) {
+            const int k = indices[i];
+            const uint32_t v = m.triangle[i / 3][i % 3];
+            assert_true(m.position_m[v][0] == (k == 1 || k == 2 ? 2 : 0) && m.position_m[v][1] == (k > 1) && m.position_m[v][2] == 0);
+            assert_true(fabsf(m.uv[v][0] - (k == 1 || k == 2 ? 1 : .2f)) < 1e-6f && fabsf(m.uv[v][1] - (k > 1 ? 1 : .2f)) < 1e-6f);
+            assert_true(m.normal[v][2] == 1);
+        }
+        mesh_free(&m);
+    }
+    snprintf(json, sizeof(json), format, "\"uri\":\"data:;base64,AAAA\","); // says 76 bytes, has 3
+    struct mesh m;
+    assert_int_equal(read_text(&m, NULL, "quad.gltf", json), -EINVAL);
+    assert_non_null(strstr(errors, "the bytes end within accessor 0"));
+}
+
+// A square of two triangles that share two corners in space but not in the atlas, as Metashape and MeshLab write them. The second
+// face names its corners after its UVs; a property of another kind lies between.
+static void ply_with_uvs_per_corner_keeps_its_seams(void **state)
+{
+    (void)state;
+    static const float position[4][3] = { { 0, 0, 0 }, { 1, 0, 0 }, { 1, 1, .25f }, { -1e-7f, 1, 0 } };
+    static const float uv[2][6] = { { .125f, 0, .25f, 0, .25f, .5f }, { .75f, .5f, 1, 1, .5f, 1 } };
+    static const int corner[2][3] = { { 0, 1, 2 }, { 0, 2, 3 } };
+    static const char *const encodings[3] = { "ascii", "binary_little_endian", "binary_big_endian" };
+    if (!setlocale(LC_ALL, "de_DE.UTF-8")) // decimal commas, where the machine has them
+        setlocale(LC_ALL, "C");
+    for (int encoding = 0; encoding < 3; encoding++) {
+        unsigned char bytes[2048];
+        int n = sprintf((char *)bytes, "ply\r\nformat %s 1.0\r\ncomment TextureFile a.png\nelement vertex 4\nproperty float x\n"
+                                       "property float y\nproperty float z\nproperty uchar red\nelement face 2\nproperty uchar flags\n"
+                                       "property list uchar float texcoord\nproperty list uchar int vertex_indices\n"
+                                       "property int texnumber\nend_header\n", encodings[encoding]);
+        for (int i = 0; i < 4 && encoding == 0; i++)
+            n += sprintf((char *)bytes + n, "%d.%02de0 %d %d.%d 7\n", (int)position[i][0], 0, (int)position[i][1], 0, i == 2 ? 25 : 0);
+        for (int i = 0; i < 2 && encoding == 0; i++) {
+            n += sprintf((char *)bytes + n, "1 6");
+            for (int k = 0; k < 6; k++)
+                n += sprintf((char *)bytes + n, " %d.%03d", (int)uv[i][k], (int)(1000 * uv[i][k]) % 1000);
+            n += sprintf((char *)bytes + n, " 3 %d %d %d -1\n", corner[i][0], corner[i][1], corner[i][2]);
+        }
+        unsigned char *at = bytes + n;
+#define PUT(value) do { uint32_t w; memcpy(&w, &(value), 4); for (int b = 0; b < 4; b++) \
+        *at++ = (unsigned char)(w >> 8 * (encoding == 1 ? b : 3 - b)); } while (0)
+        for (int i = 0; i < 4 && encoding > 0; i++) {
+            for (int k = 0; k < 3; k++)
+                PUT(position[i][k]);
+            *at++ = 7;
+        }
+        for (int i = 0; i < 2 && encoding > 0; i++) {
+            *at++ = 1, *at++ = 6;
+            for (int k = 0; k < 6; k++)
+                PUT(uv[i][k]);
+            *at++ = 3;
+            for (int k = 0; k < 3; k++)
+                PUT(corner[i][k]);
+            PUT(corner[0][0]);
+        }
+#undef PUT
+        struct mesh m;
+        struct mesh_check check;
+        const int err = read_bytes(&m, &check, "corners.ply", bytes, (size_t)(at - bytes));
+        if (err)
+            fail_msg("%s: %d %s", encodings[encoding], err, errors);
+        assert_true(m.n_triangles == 2 && m.n_points == 4 && m.n_vertices == 6 && m.n_charts == 2);
+        for (int i = 0; i < 2; i++)
+            for (int k = 0; k < 3; k++) {
+                const uint32_t v = m.triangle[i][k];
+                for (int c = 0; c < 2; c++)
+                    assert_true(m.uv[v][c] == uv[i][2 * k + c]);
+                for (int c = 0; c < 3; c++)
+                    assert_true(fabsf(m.position_m[v][c] - position[corner[i][k]][c]) < 2e-7f);
+            }
+        mesh_free(&m);
+    }
+    setlocale(LC_ALL, "C");
+}
+
 static void node_transforms_are_applied_and_mirrors_keep_their_outside(void **state)
 {
     (void)state;
@@ -466,7 +599,15 @@ static void broken_files_are_refused_with_their_place(void **state)
         { "ply\nformat ascii 1.0\nelement vertex 1\nproperty float x\nend_header\n1\n", -EINVAL, "point cloud" },
         { "ply\nformat ascii 1.0\nelement face 1\nproperty list float int vertex_indices\nend_header\n", -EINVAL, "'float'" },
         { "ply\nformat ascii 1.0\nelement face 1\nproperty list uchar int vertex_indices\n"
-          "property list uchar float texcoord\nend_header\n", -ENOTSUP, "export the mesh as OBJ or GLB" },
+          "property list uchar int texcoord\nend_header\n", -EINVAL, "texcoord is of whole numbers" },
+        { "ply\nformat ascii 1.0\nelement vertex 3\nproperty float x\nproperty float y\nproperty float z\nelement face 1\nproperty list uchar "
+          "int vertex_indices\nproperty list uchar float texcoord\nend_header\n0 0 0\n1 0 0\n0 1 0\n3 0 1 2 4 0 0 1 0\n", -EINVAL,
+          "face 0 has 4 numbers in texcoord" },
+        { "ply\nformat ascii 1.0\nelement vertex 3\nproperty float x\nproperty float y\nproperty float z\nelement face 1\nproperty list uchar "
+          "int vertex_indices\nproperty list uchar float texcoord\nend_header\n0 0 0\n1 0 0\n0 1 0\n3 0 1 2 6 0 0 1 nan 0 1\n", -EINVAL,
+          "within face 1 of 1" },
+        { "ply\nformat ascii 1.0\nelement vertex 3\nproperty float x\nproperty float y\nproperty float z\nelement face 1\nproperty list uchar "
+          "int vertex_indices\nproperty list uchar float texcoord\nend_header\n0 0 0\n1 0 0\n0 1 0\n3 0 1 2 0\n", -EINVAL, "no UVs" },
         { "ply\nformat ternary 1.0\n", -EINVAL, "'ternary'" },
         { "ply\nproperty float x\n", -EINVAL, "before any element" },
         { "ply\nformat ascii 1.0\nelement vertex 3\n", -EINVAL, "before end_header" },
@@ -506,8 +647,8 @@ static void broken_glbs_are_refused_with_their_place(void **state)
     } cases[] = {
         { "\"count\":4,\"type\":\"VEC3\"", "\"count\":5,\"type\":\"VEC3\"", -EINVAL, "accessor 0: 5 elements" },
         { "\"count\":6", "\"count\":7", -EINVAL, "accessor 2" },
-        { "\"componentType\":5126,\"count\":4,\"type\":\"VEC2\"", "\"componentType\":5123,\"count\":4,\"type\":\"VEC2\"", -ENOTSUP,
-          "TEXCOORD_0 is quantised" },
+        { "\"componentType\":5126,\"count\":4,\"type\":\"VEC2\"", "\"componentType\":5125,\"count\":4,\"type\":\"VEC2\"", -EINVAL,
+          "TEXCOORD_0 is of component type 5125" },
         { "\"type\":\"VEC3\"", "\"type\":\"VEC2\"", -EINVAL, "POSITION is VEC2; expected VEC3" },
         { "\"POSITION\":0", "\"POSITION\":9", -EINVAL, "POSITION: the accessor does not exist" },
         { "\"byteOffset\":80", "\"byteOffset\":81", -EINVAL, "bufferView 2" },
@@ -686,6 +827,8 @@ int main(void)
 {
     const struct CMUnitTest tests[] = {
         cmocka_unit_test(every_format_gives_the_same_uvs),
+        cmocka_unit_test(quantised_gltf_is_read),
+        cmocka_unit_test(ply_with_uvs_per_corner_keeps_its_seams),
         cmocka_unit_test(node_transforms_are_applied_and_mirrors_keep_their_outside),
         cmocka_unit_test(seams_are_no_creases),
         cmocka_unit_test(charts_join_where_edges_meet_in_space_and_atlas),

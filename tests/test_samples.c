@@ -58,6 +58,7 @@ static void scene_open(struct scene *s, struct mesh mesh, int texture)
 {
     *s = (struct scene){.mesh = mesh, .settings = samples_defaults()};
     s->settings.n_threads = 2;
+    s->settings.at_centre = false; // most tests are about the mean that is read
     s->cameras.view = s->view;
     assert_int_equal(rays_new(&s->rays, &s->mesh), 0);
     assert_int_equal(texels_rasterise(&s->texels, &s->mesh, texture), 0);
@@ -250,6 +251,56 @@ static void a_smooth_surface_is_read_to_the_accuracy_of_bilinear_interpolation(v
             assert_true(rms_before / rms > 3.6 && rms_before / rms < 4.4);
         rms_before = rms;
         samples_free(&got);
+        scene_close(&s);
+    }
+}
+
+// What a pixel of a real camera sees: the mean over its area.
+static void paint_mean_wave_on_floor(const struct scene *s, const struct camera *camera, int x, int y,
+                                     float *out)
+{
+    enum { N = 6 };
+    (void)s;
+    double sum = 0;
+    for (int k = 0; k < N * N; k++)
+        sum += floor_seen_at(camera, x + (k % N + .5) / N, y + (k / N + .5) / N);
+    out[0] = out[1] = out[2] = (float)(sum / (N * N));
+}
+
+static double rms_off_wave(struct scene *s)
+{
+    struct samples got;
+    double sum = 0;
+    assert_int_equal(gather(&got, s), 0);
+    assert_true(got.n > 1000);
+    for (int t = 0; t < got.n_texels; t++)
+        for (int64_t i = got.first[t]; i < got.first[t + 1]; i++) {
+            double point[3], normal[3];
+            float rgb[3];
+            texel_point(s, t, point, normal);
+            samples_radiance(&got, i, rgb);
+            sum += pow((double)rgb[0] - wave(point), 2);
+        }
+    const double rms = sqrt(sum / (double)got.n);
+    samples_free(&got);
+    return rms;
+}
+
+static void the_radiance_at_the_centre_is_exact_to_second_order(void **state)
+{
+    (void)state;
+    static const int textures[] = {320, 120}; // footprints of a pixel, and of up to two
+    for (int k = 0; k < 2; k++) {
+        struct scene s;
+        scene_open(&s, floor_mesh(), textures[k]);
+        const int v = add_view(&s, 240, 160, 220, (const double[3]){.4, -.9, 1.6},
+                               (const double[3]){.05, -.02, 0});
+        paint_view(&s, v, paint_mean_wave_on_floor);
+        const double mean = rms_off_wave(&s);
+        s.settings.at_centre = true;
+        const double centre = rms_off_wave(&s);
+        fprintf(stderr, "# texture %d: mean %.2e off, at the centre %.2e\n", textures[k], mean, centre);
+        assert_true(centre < mean / 5);
         scene_close(&s);
     }
 }
@@ -1076,6 +1127,7 @@ int main(void)
 {
     const struct CMUnitTest tests[] = {
         cmocka_unit_test(a_smooth_surface_is_read_to_the_accuracy_of_bilinear_interpolation),
+        cmocka_unit_test(the_radiance_at_the_centre_is_exact_to_second_order),
         cmocka_unit_test(a_curved_surface_is_read_better_the_larger_the_picture),
         cmocka_unit_test(no_part_of_a_pixel_is_lost_between_projection_and_picture),
         cmocka_unit_test(a_bright_pixel_is_found_where_it_is),

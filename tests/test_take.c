@@ -453,6 +453,28 @@ static void every_piece_is_found_and_views_are_sorted(void **state)
     take_close(take);
 }
 
+static void a_tools_export_under_its_own_name_is_found(void **state)
+{
+    (void)state;
+    static const char *const names[] = { "scan.xml", "IMG_1.XMP", "scan.csv", "sfm.json", "a.sfm", "bundle.out" };
+    struct take *take;
+    for (size_t i = 0; i < sizeof(names) / sizeof(names[0]); i++) {
+        char path[64];
+        assert_int_equal(make_directories(scratch_path("geometry/cameras")), 0); // as take_create left it
+        put(scratch_path("geometry/mesh.obj"), "");
+        put(scratch_path("geometry/mesh.mtl"), "");
+        snprintf(path, sizeof(path), "geometry/%s", names[i]);
+        put(scratch_path(path), "");
+        assert_int_equal(take_open(&take, scratch_dir), 0);
+        assert_string_equal(take->cameras_path, scratch_path("geometry"));
+        take_close(take);
+        assert_int_equal(unlink(scratch_path(path)), 0);
+        assert_int_equal(take_open(&take, scratch_dir), 0);
+        assert_null(take->cameras_path);
+        take_close(take);
+    }
+}
+
 static void cameras_may_be_one_file_and_a_second_mesh_is_warned_of(void **state)
 {
     (void)state;
@@ -682,6 +704,7 @@ int main(void)
         in_fresh_folder(a_new_take_has_its_folders_and_manifest_and_nothing_to_solve),
         in_fresh_folder(equal_takes_have_equal_manifests),
         in_fresh_folder(every_piece_is_found_and_views_are_sorted),
+        in_fresh_folder(a_tools_export_under_its_own_name_is_found),
         in_fresh_folder(cameras_may_be_one_file_and_a_second_mesh_is_warned_of),
         in_fresh_folder(two_views_of_one_stem_are_refused),
         in_fresh_folder(a_broken_manifest_and_a_missing_folder_are_named),

@@ -1,5 +1,7 @@
 // solver/commands/inputs.c - a TAKE, or its pieces named one by one: found, checked, loaded.
 #include "solver/commands/inputs.h"
+#include "solver/cameras_frame.h"
+#include "solver/picture_size.h"
 #include "solver/take/log.h"
 
 #include <errno.h>
@@ -16,7 +18,7 @@ enum { KEY_MESH = 0x10000, KEY_CAMERAS, KEY_IMAGES, KEY_PANORAMA, KEY_POSE };
 static const struct argp_option options[] = {
     {0, 0, 0, 0, "Input (with TAKE: in place of the take's own)", 1},
     {"mesh", KEY_MESH, "FILE", 0, "OBJ, PLY, glTF or GLB with a UV atlas", 1},
-    {"cameras", KEY_CAMERAS, "PATH", 0, "calibrated views: a COLMAP folder", 1},
+    {"cameras", KEY_CAMERAS, "PATH", 0, "calibrated views: a COLMAP folder, or Metashape's, RealityCapture's, Meshroom's or Bundler's file", 1},
     {"images", KEY_IMAGES, "DIR", 0, "the views' pictures, each of its view's name", 1},
     {"panorama", KEY_PANORAMA, "FILE", 0, "HDR panorama the lights are cut from", 1},
     {"world-from-probe", KEY_POSE, "FILE", 0,
@@ -135,6 +137,18 @@ static int find_picture(const struct inputs *in, const char *view, char **out)
     return 0;
 }
 
+// For camera files that do not say it.
+static int size_of_picture(void *arg, const char *name, int *width_px, int *height_px)
+{
+    const struct inputs *in = arg;
+    char *path;
+    int err = find_picture(in, name, &path);
+    if (!err)
+        err = path ? picture_size(width_px, height_px, path) : -ENOENT;
+    free(path);
+    return err;
+}
+
 static int find_pictures(struct inputs *in)
 {
     int err = 0;
@@ -162,9 +176,16 @@ int inputs_load(struct inputs *in)
     err = texels_rasterise(&in->texels, &in->mesh, in->texture);
     if (!err)
         err = rays_new(&in->rays, &in->mesh);
+    const struct cameras_options sizes = {.picture_size = size_of_picture, .arg = in};
     if (!err)
-        err = cameras_read(&in->cameras, in->cameras_path);
-    return err ? err : find_pictures(in);
+        err = cameras_read_for_mesh(&in->cameras, in->cameras_path, &sizes, &in->mesh,
+                                    in->mesh_path);
+    if (!err)
+        err = find_pictures(in);
+    if (!err && in->picture)
+        err = cameras_check_pictures(&in->cameras, &in->mesh, in->rays, in->picture,
+                                     in->cameras_path, in->mesh_path);
+    return err;
 }
 
 void inputs_free(struct inputs *in)

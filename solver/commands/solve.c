@@ -25,7 +25,7 @@ struct settings {
     struct joint_settings joint;
     struct solve_materials materials;
     double w_sim;
-    bool has_w_sim, no_visibility, json;
+    bool has_w_sim, no_visibility, no_planes, json;
     int texture, n_lights, n_sub, n_threads;
     uint64_t seed;
     struct inputs in;
@@ -34,7 +34,7 @@ struct settings {
 enum {
     OPTION_PRESET = 512, OPTION_METHOD,
     OPTION_TEXTURE, OPTION_LIGHTS, OPTION_SUB_LIGHTS, OPTION_HOLD_OUT, OPTION_THREADS, OPTION_SEED, OPTION_JSON,
-    OPTION_REFLECTANCE, OPTION_ALBEDO, OPTION_DISTANCE, OPTION_W_SIM, OPTION_NO_VISIBILITY, OPTION_ROBUST, OPTION_GAIN,
+    OPTION_REFLECTANCE, OPTION_ALBEDO, OPTION_DISTANCE, OPTION_W_SIM, OPTION_NO_PLANES, OPTION_NO_VISIBILITY, OPTION_ROBUST, OPTION_GAIN,
     OPTION_VERBOSE,
 };
 
@@ -50,6 +50,7 @@ static const struct argp_option options[] = {
     { "distance", OPTION_DISTANCE, "M", 0, "first distance of all lights (joint: swept; alternating: 2)", 2 },
     { "w-sim", OPTION_W_SIM, "W", 0, "weight of the similarity term: alternating 1e-3 beside the sum of squares; joint: the last one, "
       "beside their mean (default: chosen by views set aside)", 2 },
+    { "no-planes", OPTION_NO_PLANES, 0, 0, "joint: do not look for lights that lie on one plane", 2 },
     { "no-visibility", OPTION_NO_VISIBILITY, 0, 0, "every light reaches every texel above its horizon", 2 },
     { "robust", OPTION_ROBUST, 0, 0, "down-weight outliers in the last stage", 2 },
     { "gain", OPTION_GAIN, 0, 0, "one unknown exposure factor per camera", 2 },
@@ -112,6 +113,9 @@ static error_t parse_option(int key, char *text, struct argp_state *state)
     case OPTION_W_SIM:
         s->w_sim = argument_number(state, "--w-sim", text, "a number", 0, 1e6);
         s->has_w_sim = true;
+        return 0;
+    case OPTION_NO_PLANES:
+        s->no_planes = true;
         return 0;
     case OPTION_NO_VISIBILITY:
         s->no_visibility = true;
@@ -205,6 +209,7 @@ static int choose_held_out(struct scene *scene, const struct settings *s)
 static int load(struct scene *scene, struct settings *s)
 {
     struct samples_settings gather = samples_defaults();
+    struct lights cut = { 0 };
     gather.n_threads = s->n_threads;
     s->in.needs = TAKE_MESH | TAKE_CAMERAS | TAKE_PANORAMA | TAKE_VIEWS;
     s->in.texture = s->texture;
@@ -212,9 +217,10 @@ static int load(struct scene *scene, struct settings *s)
     if (!err)
         err = choose_held_out(scene, s);
     if (!err)
-        err = inputs_lights(&scene->lights, &s->in, NULL, s->n_lights * s->n_sub);
-    for (int i = 0; !err && i < scene->lights.n; i++)
-        scene->lights.group[i] = i / s->n_sub; // aligned runs are the regions of the coarser cut
+        err = inputs_lights(&cut, &s->in, NULL, s->n_lights);
+    if (!err)
+        err = lights_refine(&scene->lights, &cut, &s->in.panorama, s->n_lights * s->n_sub);
+    lights_free(&cut);
     if (err)
         return err;
     return samples_gather(&scene->samples, &s->in.texels, s->in.rays, &s->in.cameras, (const char *const *)s->in.picture,
@@ -391,6 +397,7 @@ int command_solve(int argc, char **argv)
         s.joint.start_distance_m = defaults.start_distance_m;
     s.joint.w_sim = s.has_w_sim ? s.w_sim : defaults.w_sim;
     s.joint.visibility = defaults.visibility && !s.no_visibility;
+    s.joint.planes = defaults.planes && !s.no_planes;
     s.joint.n_threads = s.n_threads;
     s.materials.no_visibility = s.no_visibility;
     if (!s.n_sub)

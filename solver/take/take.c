@@ -140,6 +140,7 @@ static int find_geometry(char **out, const char *dir, char *const *names, int n,
 static int look_at_geometry(struct take *take)
 {
     static const char *const mesh_extensions[] = { "glb", "gltf", "obj", "ply", NULL };
+    static const char *const camera_extensions[] = { "csv", "json", "out", "sfm", "xml", "xmp", NULL };
     char **names = NULL, **inside = NULL;
     int n = 0, n_inside = 0, err = -ENOMEM;
     char *dir = joined(take->dir, "geometry"), *cameras = dir ? joined(dir, "cameras") : NULL;
@@ -161,6 +162,11 @@ static int look_at_geometry(struct take *take)
     }
     if (!take->cameras_path)
         err = find_geometry(&take->cameras_path, dir, names, n, "cameras", NULL);
+    for (int i = 0; i < n && !err && !take->cameras_path; i++) // what a tool exported, under its own name
+        if (ends_in(names[i], camera_extensions)) {
+            take->cameras_path = dir;
+            dir = NULL;
+        }
 done:
     free_names(names, n);
     free_names(inside, n_inside);
@@ -307,8 +313,8 @@ int take_require(const struct take *take, unsigned needs)
         { TAKE_MESH, take->mesh_path,
           "geometry/mesh.obj (or .ply, .glb, .gltf), which the photogrammetry tool exports" },
         { TAKE_CAMERAS, take->cameras_path,
-          "geometry/cameras (a COLMAP folder or a camera file), which the photogrammetry tool "
-          "exports" },
+          "geometry/cameras (a COLMAP folder, or the camera file or sidecars of another tool), which "
+          "the photogrammetry tool exports" },
         { TAKE_PANORAMA, take->panorama_path,
           "panorama.exr, which `rigctl panorama` takes and develops" },
         { TAKE_VIEWS, take->n_views > 0,

@@ -10,7 +10,8 @@ struct take {
     char *dir;
     struct json *manifest;  // take.json, or NULL where there is none (a plain folder with the same pieces)
     char *mesh_path;        // geometry/mesh.*; NULL: none yet; of several the first bytewise, with a warning
-    char *cameras_path;     // geometry/cameras (folder, not empty) or geometry/cameras.*; NULL: none yet
+    char *cameras_path;     // geometry/cameras (folder, not empty) or geometry/cameras.*; geometry itself where another
+                            // *.{xml,xmp,csv,sfm,json,out} lies in it; NULL: none yet
     char *panorama_path;    // panorama.exr, else panorama.hdr; NULL: none yet
     char *linear_dir;       // NULL: none yet
     char *start_path;       // start.json: rough world_from_probe; NULL: none
