@@ -15,6 +15,7 @@
 #endif
 
 static const float most_albedo = 1.5f, white = 1;
+static const float registration_px = .25f, usual_error = .02f; // a sample may lie so far off; what its error is without that
 enum { OWN = DISNEY_N, RESIDUAL, N_COLUMNS, STRIDE = 16, ROBUST_ROUNDS = 3 };
 
 struct observation {
@@ -104,7 +105,8 @@ static int observe(const struct texel_scene *s, struct texel_worker *w, int texe
             o->o[c] = fminf(o->o[c], white);
         samples_view_direction(m, s->texels, texel, o->view, w->v[k]);
         const float *v = w->v[k], *N = s->texels->normal[texel], nv = N[0] * v[0] + N[1] * v[1] + N[2] * v[2];
-        o->base = s->weigh_grazing ? fminf(1, fmaxf(2 * nv, 0)) : 1;
+        const float slip = samples_gradient(m, i) * registration_px / usual_error;
+        o->base = s->weigh_grazing ? fminf(1, fmaxf(2 * nv, 0)) / (1 + slip * slip) : 1;
     }
     return n_used;
 }
