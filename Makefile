@@ -33,7 +33,7 @@ endif
 # ---- what is built ------------------------------------------------------------------------------------------------------
 TAKE := $(addprefix solver/take/,atomic_file.c image.c image_exr.c image_hdr.c image_png.c image_tiff.c json.c log.c progress.c take.c)
 SOLVER := $(addprefix solver/,alternating.c cameras.c cameras_bundler.c cameras_colmap.c cameras_format.c cameras_frame.c cameras_meshroom.c \
-  cameras_metashape.c cameras_realitycapture.c compare.c csv.c disney.c emitters.c joint.c levels.c lights.c lm.c materials.c mesh.c mesh_gltf_floats.c \
+  cameras_metashape.c cameras_realitycapture.c compare.c csv.c disney.c emitters.c interreflection.c joint.c levels.c lights.c lm.c materials.c mesh.c mesh_gltf_floats.c \
   mesh_import.c normal_equations.c orientation.c panorama.c parallel.c pcg.c photometric.c picture_size.c rays.c regions.c relocate.c render.c samples.c \
   shapes.c stage1.c synth.c texel_fit.c texels.c visibility.c xml.c)
 KERNELS := $(addprefix solver/kernels/,kernels.c kernels_ref.c kernels_portable.c kernels_avx2.c kernels_avx512.c)

@@ -1,6 +1,7 @@
 // solver/materials.c - stage 2: Levenberg-Marquardt over a pyramid of textures, tile by tile.
 #include "solver/materials.h"
 
+#include "solver/interreflection.h"
 #include "solver/packed.h"
 #include "solver/parallel.h"
 #include "solver/pcg.h"
@@ -18,6 +19,7 @@ enum {
     SELECT_SIZE = 64,      // regions are found on the finest level no larger
     EVALUATE_CHUNK = 32, ROW_CHUNK = 2048,
     WEAK_SAMPLES = 8,
+    BOUNCE_RAYS = 64, BOUNCE_LOOKS = 3, // rays per texel; how often the albedo is found and light sent out again
 };
 static const double first_mu = 1e-3, least_mu = 1e-7, most_mu = 1e9;
 static const float settled = 5e-4f; // a smaller step is not worth looking at the samples again
@@ -712,10 +714,49 @@ static int pyramid(struct estimate *e, const struct materials_input *in, struct 
     return m->region ? 0 : -ENOMEM;
 }
 
+// Light from the object itself, under the albedo that fits what theta the last look found.
+static void fit_albedos(void *arg, int64_t begin, int64_t end, int worker)
+{
+    struct judging *j = arg;
+    for (int t = (int)begin; t < (int)end; t++) {
+        struct texel_sums sums = { 0 };
+        texel_fit(&j->e->scene, j->e->worker[worker], t, DELEGATE_VIEWS, j->m->theta[t], j->e->albedo[t], 1, &sums);
+    }
+}
+
+static int bounce(struct estimate *e, const struct materials_input *in, struct materials *m, float (*indirect)[3])
+{
+    struct judging j = { .e = e, .m = m };
+    float(*diffuse)[3] = malloc(((size_t)m->n_texels + 1) * sizeof(*diffuse));
+    if (!diffuse)
+        return -ENOMEM;
+    const struct interreflection light = { .texels = in->texels, .mesh = in->mesh, .rays = in->rays, .lights = &e->scene.lights, .kernels = e->scene.kernels,
+                                           .visible = in->visible, .words_per_texel = in->words_per_texel, .diffuse = (const float(*)[3])diffuse,
+                                           .n_rays = BOUNCE_RAYS, .n_threads = e->set->n_threads };
+    int err = 0;
+    parallel_for(e->set->n_threads, m->n_texels, EVALUATE_CHUNK, fit_albedos, &j);
+    for (int t = 0; t < m->n_texels; t++)
+        for (int c = 0; c < 3; c++)
+            diffuse[t][c] = e->albedo[t][c] * (1 - m->theta[t][DISNEY_METALLIC]);
+    memset(indirect, 0, (size_t)m->n_texels * sizeof(*indirect));
+    for (int k = 0; !err && k < e->set->n_bounces; k++)
+        err = interreflection_gather(&light, indirect);
+    free(diffuse);
+    return err;
+}
+
+static void clear_look(struct materials *m)
+{
+    free(m->theta), free(m->region);
+    m->theta = NULL, m->region = NULL, m->n_levels = 0;
+    memset(&m->regions, 0, sizeof(m->regions));
+}
+
 int materials_solve(struct materials *out, const struct materials_input *in, const struct materials_settings *set)
 {
     struct estimate e;
     struct materials m = { .n_texels = in->texels->n, .rmse_held_out_percent = -1 };
+    struct materials_settings look = *set;
     const size_t n = (size_t)m.n_texels + 1;
     memset(out, 0, sizeof(*out));
     int err = estimate_new(&e, in, set);
@@ -726,11 +767,26 @@ int materials_solve(struct materials *out, const struct materials_input *in, con
         for (int c = 0; c < 3; c++)
             m.albedo[t][c] = in->start_albedo ? in->start_albedo[t][c] : .5f;
     e.albedo = m.albedo;
+    if (!err && set->n_bounces > 0) {
+        float(*indirect)[3] = calloc(n, sizeof(*indirect));
+        err = indirect ? 0 : -ENOMEM;
+        look.most_size = set->most_size && set->most_size < SELECT_SIZE ? set->most_size : SELECT_SIZE;
+        e.set = &look;
+        for (int k = 0; !err && k < BOUNCE_LOOKS; k++) {
+            err = pyramid(&e, in, &m);
+            if (!err)
+                err = bounce(&e, in, &m, indirect);
+            e.scene.indirect = (const float(*)[3])indirect; // freed with the estimate
+            e.regions = NULL;
+            clear_look(&m);
+        }
+        if (!e.scene.indirect)
+            free(indirect);
+        e.set = set;
+    }
     if (!err)
         err = pyramid(&e, in, &m);
-    if (!err && set->most_size && set->most_size < in->texels->size) {
-        // a look on the way: nothing is judged
-    } else if (!err) {
+    if (!err && !(set->most_size && set->most_size < in->texels->size)) { // a look on the way is not judged
         m.std = malloc(n * sizeof(*m.std)), m.validity = calloc(n, 1), m.coverage = calloc(n, sizeof(*m.coverage));
         err = m.std && m.validity && m.coverage ? judge(&e, &m) : -ENOMEM;
         if (!err)

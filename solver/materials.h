@@ -24,7 +24,7 @@ struct materials_settings {
     bool weigh_grazing, robust;
     bool selection;      // model selection per region
     int cap;             // samples a coarse texel looks at, about
-    int n_bounces;       // how often diffuse interreflection is gathered; 0: none
+    int n_bounces;       // of diffuse interreflection, gathered anew under each of three estimates of the albedo; 0: none
     int most_size;       // levels finer than this are left out: texels inherit (0: none is)
     int n_threads;
 };

@@ -111,6 +111,13 @@ static int observe(const struct texel_scene *s, struct texel_worker *w, int texe
     return n_used;
 }
 
+// Of light from all around: metal and diffuse base send back their colour, the dielectric's surface what it reflects head-on.
+static const float head_on = .08f;
+static float ambient_reflectance(const float theta[DISNEY_N], float albedo)
+{
+    return albedo + head_on * theta[DISNEY_SPECULAR] * (1 - theta[DISNEY_METALLIC]);
+}
+
 // Jacobians of the observations, and their residuals; gain and indirect light are in.
 static void shade(const struct texel_scene *s, struct texel_worker *w, int texel, int n, const float theta[DISNEY_N],
                   const float albedo[3])
@@ -127,12 +134,13 @@ static void shade(const struct texel_scene *s, struct texel_worker *w, int texel
         struct shade_jacobian *d = &w->jacobian[k];
         struct observation *o = &w->seen[k];
         for (int c = 0; c < 3; c++) {
-            if (s->indirect) { // as if diffuse: arrives from all around
-                const float E = s->indirect[texel][c] * (float)M_1_PI, dielectric = 1 - theta[DISNEY_METALLIC];
-                d->L[c] += E * albedo[c] * dielectric;
-                d->own[c] += E * dielectric;
-                d->albedo[c][c] += E * dielectric;
-                d->theta[c][DISNEY_METALLIC] -= E * albedo[c];
+            if (s->indirect) {
+                const float E = s->indirect[texel][c] * (float)M_1_PI, gloss = head_on * (1 - theta[DISNEY_METALLIC]);
+                d->L[c] += E * ambient_reflectance(theta, albedo[c]);
+                d->own[c] += E;
+                d->albedo[c][c] += E;
+                d->theta[c][DISNEY_METALLIC] -= E * head_on * theta[DISNEY_SPECULAR];
+                d->theta[c][DISNEY_SPECULAR] += E * gloss;
             }
             o->own[c] = o->gain * d->own[c];
             o->r[c] = o->gain * d->L[c] - o->o[c];
@@ -283,7 +291,7 @@ void texel_measure(const struct texel_scene *s, struct texel_worker *w, int texe
         s->kernels->shade(L, &w->lit, &point, w->v[k], &m);
         for (int c = 0; c < 3; c++) {
             if (s->indirect)
-                L[c] += s->indirect[texel][c] * (float)M_1_PI * albedo[c] * (1 - theta[DISNEY_METALLIC]);
+                L[c] += s->indirect[texel][c] * (float)M_1_PI * ambient_reflectance(theta, albedo[c]);
             L[c] *= o->gain;
             o->r[c] = L[c] - o->o[c];
             const float shown = fminf(fmaxf(L[c], 0), white) - fminf(fmaxf(o->o[c], 0), white);

@@ -26,7 +26,7 @@ static const struct argp_option options[] = {
     { "no-seams", KEY_NO_SEAMS, 0, 0, "charts of the atlas know nothing of each other", 4 },
     { "no-selection", KEY_NO_SELECTION, 0, 0, "every parameter is free at every texel", 4 },
     { "relocate", KEY_RELOCATE, "N", 0, "find the lights again under the materials, at most N times (joint: 2; with --lights-from: 0)", 4 },
-    { "bounces", KEY_BOUNCES, "N", 0, "gather diffuse interreflection N times (0)", 4 },
+    { "bounces", KEY_BOUNCES, "N", 0, "light that the object sends to itself, as if diffuse: N bounces (0)", 4 },
     { 0 },
 };
 
