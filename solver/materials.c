@@ -786,7 +786,11 @@ int materials_solve(struct materials *out, const struct materials_input *in, con
     }
     if (!err)
         err = pyramid(&e, in, &m);
-    if (!err && !(set->most_size && set->most_size < in->texels->size)) { // a look on the way is not judged
+    if (!err && set->most_size && set->most_size < in->texels->size && set->free_albedo) {
+        struct judging j = { .e = &e, .m = &m };
+        parallel_for(set->n_threads, m.n_texels, EVALUATE_CHUNK, fit_albedos, &j);
+    }
+    if (!err && !set->look) {
         m.std = malloc(n * sizeof(*m.std)), m.validity = calloc(n, 1), m.coverage = calloc(n, sizeof(*m.coverage));
         err = m.std && m.validity && m.coverage ? judge(&e, &m) : -ENOMEM;
         if (!err)

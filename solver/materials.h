@@ -25,7 +25,8 @@ struct materials_settings {
     bool selection;      // model selection per region
     int cap;             // samples a coarse texel looks at, about
     int n_bounces;       // of diffuse interreflection, gathered anew under each of three estimates of the albedo; 0: none
-    int most_size;       // levels finer than this are left out: texels inherit (0: none is)
+    int most_size;       // levels finer than this are left out: texels inherit theta (0: none is); the albedo is every texel's own
+    bool look;           // a look on the way: nothing is judged, std, validity and coverage stay NULL
     int n_threads;
 };
 struct materials_settings materials_defaults(void); // ours

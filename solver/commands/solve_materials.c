@@ -15,7 +15,7 @@
 #include <sys/stat.h>
 #include <unistd.h>
 
-enum { KEY_STAGE = 0x20000, KEY_LIGHTS_FROM, KEY_W_REG, KEY_W_PARENT, KEY_NO_SEAMS, KEY_BOUNCES, KEY_NO_SELECTION, KEY_RELOCATE };
+enum { KEY_STAGE = 0x20000, KEY_LIGHTS_FROM, KEY_W_REG, KEY_W_PARENT, KEY_NO_SEAMS, KEY_BOUNCES, KEY_NO_SELECTION, KEY_RELOCATE, KEY_PARAMETER_TEXTURE };
 
 static const struct argp_option options[] = {
     { 0, 0, 0, 0, "Materials", 4 },
@@ -23,10 +23,11 @@ static const struct argp_option options[] = {
     { "lights-from", KEY_LIGHTS_FROM, "PATH", 0, "no stage 1: lights of an earlier solve's folder, or of a lights.json", 4 },
     { "w-reg", KEY_W_REG, "W", 0, "weight of the textures' smoothness beside the sum of squares (joint: .02; alternating: 1)", 4 },
     { "w-parent", KEY_W_PARENT, "W", 0, "weight that draws a texel towards its coarser parent (joint: .02; alternating: 0)", 4 },
+    { "parameter-texture", KEY_PARAMETER_TEXTURE, "N", 0, "the ten parameters no finer than N x N; the albedo keeps --texture", 4 },
     { "no-seams", KEY_NO_SEAMS, 0, 0, "charts of the atlas know nothing of each other", 4 },
     { "no-selection", KEY_NO_SELECTION, 0, 0, "every parameter is free at every texel", 4 },
     { "relocate", KEY_RELOCATE, "N", 0, "find the lights again under the materials, at most N times (joint: 2; with --lights-from: 0)", 4 },
-    { "bounces", KEY_BOUNCES, "N", 0, "light that the object sends to itself, as if diffuse: N bounces (0)", 4 },
+    { "bounces", KEY_BOUNCES, "N", 0, "light that the object sends to itself, as if diffuse: N bounces (joint: 1; else 0)", 4 },
     { 0 },
 };
 
@@ -37,7 +38,7 @@ static error_t parse(int key, char *text, struct argp_state *state)
     case ARGP_KEY_INIT:
         s->last_stage = 2;
         s->w_reg = s->w_parent = -1;
-        s->n_relocations = -1;
+        s->n_relocations = s->n_bounces = -1;
         return 0;
     case KEY_STAGE:
         s->last_stage = (int)argument_integer(state, "--stage", text, 1, 2);
@@ -50,6 +51,9 @@ static error_t parse(int key, char *text, struct argp_state *state)
         return 0;
     case KEY_W_PARENT:
         s->w_parent = argument_number(state, "--w-parent", text, "a number", 0, 1e6);
+        return 0;
+    case KEY_PARAMETER_TEXTURE:
+        s->most_size = (int)argument_integer(state, "--parameter-texture", text, 1, 4096);
         return 0;
     case KEY_NO_SEAMS:
         s->no_seams = true;
@@ -199,7 +203,7 @@ int solve_find_materials(struct materials *out, const struct solve_materials *se
     settings.n_threads = n_threads;
     settings.seams = !set->no_seams;
     settings.selection = settings.selection && !set->no_selection;
-    settings.n_bounces = set->n_bounces;
+    settings.n_bounces = set->n_bounces >= 0 ? set->n_bounces : method == METHOD_JOINT && !set->no_visibility;
     if (set->w_reg >= 0)
         settings.w_reg = set->w_reg;
     if (set->w_parent >= 0)
@@ -212,7 +216,7 @@ int solve_find_materials(struct materials *out, const struct solve_materials *se
     for (int round = 0; !err && round < n_relocations; round++) {
         struct materials look = { 0 };
         double before, after;
-        settings.most_size = 64;
+        settings.most_size = set->most_size && set->most_size < 64 ? set->most_size : 64, settings.look = true;
         err = materials_solve(&look, &input, &settings);
         if (!err)
             err = relocate_lights(&stage1->state, &in->texels, samples, in->rays, n_groups, held_out, (const float(*)[DISNEY_N])look.theta, joint,
@@ -226,7 +230,7 @@ int solve_find_materials(struct materials *out, const struct solve_materials *se
         if (!err && after > .97 * before)
             break;
     }
-    settings.most_size = 0;
+    settings.most_size = set->most_size, settings.look = false;
     if (!err)
         err = materials_solve(out, &input, &settings);
     light_visibility_free(&visibility);

@@ -8,7 +8,7 @@ struct solve_materials {
     int last_stage;          // --stage: 1 stops after the lights
     const char *lights_from; // --lights-from: a solve's folder or a lights.json; NULL: stage 1 finds them
     double w_reg, w_parent;  // negative: the method's own
-    int n_bounces, n_relocations;
+    int n_bounces, n_relocations, most_size;
     bool no_seams, no_selection, no_visibility;
 };
 extern const struct argp solve_materials_argp; // child of solve's; its input is a struct solve_materials

@@ -9,7 +9,7 @@
 
 struct truth_maps {
     struct image albedo, theta, region; // theta: ten channels, in order; region may be empty
-    float id_scale;                     // Cycles writes ids as id / 255 or id / most
+    float id_scale;                     // Cycles writes ids as id / 255
 };
 
 static void maps_free(struct truth_maps *t)
@@ -54,12 +54,10 @@ static int read_maps(struct truth_maps *t, const char *take)
         err = read_theta(&t->theta, take);
     if (!err && judge_has(path, take, "truth/region_id.exr"))
         err = judge_read_texture(&t->region, path);
-    t->id_scale = 1;
-    for (size_t i = 0; !err && t->region.data && i < (size_t)t->region.width * (size_t)t->region.height; i++) {
-        const float id = t->region.data[i * (size_t)t->region.n_channels];
-        if (id > 0 && id < .99f && (double)t->id_scale < 1 / (double)id)
-            t->id_scale = 1 / id; // the smallest that is not 0 is 1
-    }
+    float most = 0;
+    for (size_t i = 0; !err && t->region.data && i < (size_t)t->region.width * (size_t)t->region.height; i++)
+        most = fmaxf(most, t->region.data[i * (size_t)t->region.n_channels]);
+    t->id_scale = most > 0 && most < .5f ? 255 : 1;
     return err;
 }
 
@@ -78,11 +76,12 @@ static int region_at(const struct truth_maps *t, int size, uint32_t pixel)
     if (!t->region.data)
         return 0;
     const int reach = t->region.width / size + 1;
-    const float here = nearest(&t->region, size, pixel, 0, 0)[0], id = here * t->id_scale;
+    const long here = lroundf(nearest(&t->region, size, pixel, 0, 0)[0] * t->id_scale);
     for (int k = 0; k < 9; k++)
-        if (nearest(&t->region, size, pixel, (k % 3 - 1) * reach, (k / 3 - 1) * reach)[0] != here)
+        if (nearest(&t->region, size, pixel, (k % 3 - 1) * reach, (k / 3 - 1) * reach)[0] * t->id_scale < (float)here - .5f ||
+            nearest(&t->region, size, pixel, (k % 3 - 1) * reach, (k / 3 - 1) * reach)[0] * t->id_scale > (float)here + .5f)
             return RIM;
-    return id >= 0 && id < MOST_REGIONS ? (int)(id + .5f) : RIM;
+    return here >= 0 && here < MOST_REGIONS ? (int)here : RIM;
 }
 
 struct tally {
