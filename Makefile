@@ -32,16 +32,20 @@ endif
 
 # ---- what is built ------------------------------------------------------------------------------------------------------
 TAKE := $(addprefix solver/take/,atomic_file.c image.c image_exr.c image_hdr.c image_png.c image_tiff.c json.c log.c progress.c take.c)
-SOLVER := $(addprefix solver/,alternating.c cameras.c cameras_bundler.c cameras_colmap.c cameras_format.c cameras_frame.c cameras_meshroom.c \
-  cameras_metashape.c cameras_realitycapture.c compare.c csv.c disney.c emitters.c interreflection.c joint.c levels.c lights.c lm.c materials.c mesh.c mesh_gltf_floats.c \
-  mesh_import.c normal_equations.c orientation.c panorama.c parallel.c pcg.c photometric.c picture_size.c rays.c regions.c relocate.c render.c samples.c \
-  shapes.c stage1.c synth.c texel_fit.c texels.c visibility.c xml.c)
+SOLVER := $(addprefix solver/,alternating.c cameras.c cameras_bundler.c cameras_colmap.c cameras_format.c cameras_frame.c \
+  cameras_meshroom.c cameras_metashape.c cameras_realitycapture.c compare.c csv.c disney.c emitters.c export.c export_glb.c \
+  export_materialx.c export_obj.c gltf_brdf.c interreflection.c joint.c levels.c lights.c lm.c materials.c mesh.c mesh_gltf_floats.c mesh_import.c misfit.c normal_equations.c \
+  orientation.c panorama.c parallel.c pcg.c photometric.c picture_size.c rays.c regions.c relocate.c render.c report.c samples.c shapes.c stage1.c synth.c \
+  texel_fit.c texels.c visibility.c xml.c)
 KERNELS := $(addprefix solver/kernels/,kernels.c kernels_ref.c kernels_portable.c kernels_avx2.c kernels_avx512.c)
-COMMANDS := $(addprefix solver/commands/,arguments.c brdf.c compare.c inputs.c lights.c output.c render.c solve.c solve_materials.c synth.c visibility.c)
+COMMANDS := $(addprefix solver/commands/,arguments.c brdf.c compare.c export.c inputs.c lights.c output.c render.c report.c solve.c solve_materials.c solved.c synth.c visibility.c)
 LIBRARY := $(TAKE) $(SOLVER) $(KERNELS)
-FUZZED := $(TAKE) $(addprefix solver/,cameras.c cameras_bundler.c cameras_colmap.c cameras_format.c cameras_meshroom.c cameras_metashape.c \
-  cameras_realitycapture.c csv.c lights.c mesh.c mesh_gltf_floats.c mesh_import.c orientation.c panorama.c parallel.c picture_size.c texels.c xml.c)
-TESTS := $(addprefix test_,brdf cameras cameras_import compare csv disney image joint json judge levels lights lm materials mesh normal_equations orientation panorama parallel pcg photometric rays render samples shapes synth take texels vec3 visibility) check_kernels
+FUZZED := $(TAKE) $(addprefix solver/,cameras.c cameras_bundler.c cameras_colmap.c cameras_format.c cameras_meshroom.c \
+  cameras_metashape.c cameras_realitycapture.c csv.c lights.c mesh.c mesh_gltf_floats.c mesh_import.c orientation.c panorama.c parallel.c \
+  picture_size.c texels.c xml.c)
+TESTS := $(addprefix test_,alternating brdf cameras cameras_import compare csv disney export gltf_brdf image joint json judge levels lights lm materials \
+  mesh misfit normal_equations orientation panorama parallel pcg photometric rays render report samples shapes stability synth take \
+  texels vec3 visibility) check_kernels
 FUZZERS := cameras cameras_import csv exr hdr json lights mesh
 
 # ---- rules --------------------------------------------------------------------------------------------------------------
@@ -78,6 +82,7 @@ $(BUILD)/tests/%: $(BUILD)/obj/tests/%.o $(BUILD)/libstudiorig.a
 	@mkdir -p $(@D)
 	@$(if $(V),,echo '  LD $@')
 	$(Q)$(CC) $(CFLAGS_ALL) $^ -lcmocka $(LIBS) -o $@
+$(BUILD)/tests/bench/stability_joint: $(call object,solver/commands/arguments.c)
 $(BUILD)/tests/test_pcg: LIBS += $(if $(wildcard /usr/include/suitesparse/cholmod.h),-lcholmod)
 $(BUILD)/fuzz/obj/%.o: %.c Makefile | deps-fuzz
 	@mkdir -p $(@D)
@@ -128,12 +133,15 @@ experiments: deps $(BUILD)/bin/rigsolve $(BUILD)/tests/bench/judge
 chart: deps deps-bench $(BUILD)/tests/bench/chart_lights
 	@mkdir -p build/chart && $(BUILD)/tests/bench/chart_lights >build/chart/lights.csv && gnuplot -e "out='build/chart/lights'" tests/bench/chart_lights.gp
 	@echo "chart: build/chart/lights.csv .svg .png: seconds against error over N, roughness and kernel"
-stability: deps deps-bench $(BUILD)/tests/bench/stability_kernels
+STABILITY_OPTIONS ?=
+stability: deps deps-bench $(BUILD)/tests/bench/stability_kernels $(BUILD)/tests/bench/stability_joint
 	@mkdir -p build/stability && $(BUILD)/tests/bench/stability_kernels >build/stability/kernels.csv && gnuplot -e "out='build/stability/kernels'" tests/bench/stability_kernels.gp
 	@echo "stability: build/stability/kernels.csv .svg .png: where float32 fails, over roughness and elevation"
+	@$(BUILD)/tests/bench/stability_joint $(STABILITY_OPTIONS) >build/stability/joint.csv && gnuplot -e "out='build/stability/joint'" tests/bench/stability_joint.gp
+	@echo "stability: build/stability/joint.csv .svg .png: where the lights are found, where not, and whether the solver says so"
 
 # ---- installation ---------------------------------------------------------------------------------------------------------
-MAN := $(addprefix $(BUILD)/man/rigsolve,.1 $(addprefix -,$(addsuffix .1,$(filter-out arguments inputs output solve_materials,$(notdir $(COMMANDS:.c=))))))
+MAN := $(addprefix $(BUILD)/man/rigsolve,.1 $(addprefix -,$(addsuffix .1,$(filter-out arguments inputs output solve_materials solved,$(notdir $(COMMANDS:.c=))))))
 man: $(MAN)
 $(BUILD)/man/rigsolve.1: $(BUILD)/bin/rigsolve
 	@mkdir -p $(@D)

@@ -61,22 +61,52 @@ static int split_by_luminosity(const struct stage1 *s, float *low, float *high)
     return err;
 }
 
+// Where the search for the distances begins: 1/r of each light.
+static void first_distances(const struct stage1 *s, double *inverse_distance)
+{
+    const double common_m = s->set->start_distance_m > 0 ? s->set->start_distance_m : 2;
+    for (int i = 0; i < s->base.lights.n; i++) {
+        const double own = s->base.lights.inverse_distance[i];
+        inverse_distance[i] = s->set->start_distance_m > 0 || own <= 0 ? 1 / common_m : own;
+    }
+}
+
+// No light is inside the object: there, where what it lights ends, the search sticks.
+static void keep_lights_off(struct stage1 *s)
+{
+    const struct texels *t = s->p.texels;
+    double radius_m = 0;
+    for (int i = 0; i < t->n; i++) {
+        double off[3];
+        for (int c = 0; c < 3; c++)
+            off[c] = t->position_m[i][c] - s->first_centre_m[c];
+        radius_m = fmax(radius_m, vec3_norm(off));
+    }
+    for (int g = 0; g < s->p.n_groups; g++) {
+        double *lower = &s->lower[s->layout.inverse_distance + g];
+        *lower = fmin(fmax(*lower, 1.5 * radius_m), s->upper[s->layout.inverse_distance + g]);
+    }
+}
+
 int stage1_alternate(struct stage1 *s, const uint8_t *fit)
 {
-    const size_t n = (size_t)s->p.samples->n;
+    const size_t n = (size_t)s->p.samples->n, n_lights = (size_t)s->base.lights.n;
     float *low = malloc((n + 1) * sizeof(float)), *high = malloc((n + 1) * sizeof(float));
+    double *first = malloc(n_lights * sizeof(double));
     struct photometric_error e;
-    int err = low && high ? 0 : -ENOMEM;
+    double cost = INFINITY; // of a bright sample
+    int err = low && high && first ? 0 : -ENOMEM;
+    if (err)
+        goto end;
+    first_distances(s, first);
+    keep_lights_off(s);
     s->p.use_view = fit;
     s->p.texel_step = 1;
-    const double start_m = s->set->start_distance_m > 0 ? s->set->start_distance_m : 2;
-    stage1_set_distances(s, start_m);
-    s->stop = "cost";
-    if (!err && s->p.model == REFLECT_LAMBERT) { // data sets 1 and 2: the albedo is known or shared, so there is nothing to alternate
-        err = photometric_evaluate(&s->p, &s->base, false, &e);
-        s->w_sim = s->set->w_sim / fmax(3 * (double)e.n, 1);
-        if (!err)
-            err = stage1_minimise(s, 60, 1e-6, NULL);
+    s->w_sim = s->set->w_sim;
+    if (s->p.model == REFLECT_LAMBERT) { // data sets 1 and 2: the albedo is known or shared, so there is nothing to alternate
+        memcpy(s->base.lights.inverse_distance, first, n_lights * sizeof(double));
+        err = stage1_minimise(s, 60, 1e-6, NULL);
+        s->w_sim_sum = s->w_sim * s->n_residuals;
         goto end;
     }
     progress_begin("alternating", 30);
@@ -89,10 +119,10 @@ int stage1_alternate(struct stage1 *s, const uint8_t *fit)
             err = photometric_evaluate(&dark, &s->base, true, &e);
         if (!err)
             err = split_by_luminosity(s, low, high); // with the new albedo
-        if (round == 0)
-            stage1_set_distances(s, start_m);
         if (err)
             break;
+        if (round == 0)
+            memcpy(s->base.lights.inverse_distance, first, n_lights * sizeof(double));
         s->p.weight = high, s->p.albedo = ALBEDO_GIVEN;
         err = photometric_evaluate(&s->p, &s->base, false, &e);
         if (err)
@@ -101,22 +131,25 @@ int stage1_alternate(struct stage1 *s, const uint8_t *fit)
             s->stop = "no bright samples";
             break;
         }
-        s->w_sim = s->set->w_sim / (3 * (double)e.n);
-        const double before = e.cost;
         err = stage1_minimise(s, 20, 1e-6, NULL);
+        s->w_sim_sum = s->w_sim * s->n_residuals;
         if (!err)
             err = photometric_evaluate(&s->p, &s->base, false, &e);
         progress_add(1);
-        if (!err && round > 0 && fabs(before - e.cost) < 1e-4 * before)
+        // The two halves do not fall along one function, so from some round on they may well rise together.
+        const double before = cost;
+        cost = e.cost / (double)e.n;
+        s->stop = "max_iterations";
+        if (!err && cost > (1 - 1e-4) * before) {
+            s->stop = "cost";
             break;
-        if (round == 29)
-            s->stop = "max_iterations";
+        }
     }
     progress_end();
 end:
     s->p.weight = NULL;
     free(low);
     free(high);
+    free(first);
     return err;
 }
-

@@ -2,6 +2,7 @@
 #include "solver/stage1.h"
 
 #include "solver/lm.h"
+#include "solver/misfit.h"
 #include "solver/take/log.h"
 #include "solver/take/progress.h"
 #include "solver/vec3.h"
@@ -14,7 +15,7 @@ const char *const method_names[3] = { "joint", "alternating", "directional" };
 
 struct joint_settings joint_defaults(enum method method)
 {
-    return (struct joint_settings){ .method = method, .w_sim = method == METHOD_ALTERNATING ? 1e-3 : -1,
+    return (struct joint_settings){ .method = method, .w_sim = method == METHOD_ALTERNATING ? 3e-9 : -1,
                                     .start_distance_m = method == METHOD_ALTERNATING ? 2 : 0, .visibility = method == METHOD_JOINT,
                                     .planes = method == METHOD_JOINT, .robust = false };
 }
@@ -114,10 +115,11 @@ static int sweep(const struct photometric *p, const struct lights *lights, const
     return err;
 }
 
-// Half floats and bilinear look-ups leave about this much (percent of white) in any comparison; to gain less is to gain nothing.
-static const double floor_percent = .03;
+// To gain less than this is to gain nothing (percent of white, root of the difference of squares): sampling the pictures, and lights that
+// are points, leave as much. And a quarter of what else the model lacks, as the best fit shows it.
+static const double floor_percent = .045, floor_of_structure = .25;
 // A plane's lights are held on it this much harder than neighbours on one sphere, of which each has 8 at 1 / |dh_i - dh_j|^2 ~ 50.
-static const double plane_share = 400, first_plane_w_sim = 1e-5, plane_tolerance = .06;
+static const double plane_share = 400, plane_tolerance = .06;
 
 // Lights that lie on one plane by now are held on it.
 static int find_planes(struct stage1 *s, double tolerance, double w_plane)
@@ -140,8 +142,8 @@ static int find_planes(struct stage1 *s, double tolerance, double w_plane)
 }
 
 // Continuation: w_sim falls by decades, and after each step the views set aside are measured. Kept is the *largest* weight whose
-// error is within 3 % of the best, or within the pictures' own rounding: below that, lights that the pictures hardly see drift off
-// for nothing.
+// error is as good as the best: below that, lights that the pictures hardly see drift off for nothing. Then lights that lie on one plane
+// are held on it, twice, for lights that stand better may join.
 static int continuation(struct stage1 *s, const uint8_t *aside)
 {
     enum { MAX_STEPS = 13 };
@@ -153,10 +155,6 @@ static int continuation(struct stage1 *s, const uint8_t *aside)
     for (double w = first_w_sim; !err && n < MAX_STEPS; w = w > 1e-13 ? w / 10 : 0) {
         struct photometric_error e;
         s->w_sim = weight[n] = w > last ? w : last;
-        if (s->set->planes && w <= first_plane_w_sim)
-            err = find_planes(s, plane_tolerance, plane_share * s->w_sim);
-        if (err)
-            break;
         s->p.texel_step = stage1_step_for(s, COARSE_SAMPLES);
         err = stage1_trace_visibility(s);
         if (!err)
@@ -179,16 +177,35 @@ static int continuation(struct stage1 *s, const uint8_t *aside)
         if (w <= last || (s->set->w_sim < 0 && w < 1e-8 && n_worse >= 3))
             break;
     }
+    struct misfit left = { 0 };
+    for (int k = 0; !err && k < n; k++)
+        if (error[k] == best) {
+            photometric_state_copy(&s->p, &s->base, &at[k]);
+            err = misfit_measure(&left, &s->p, &s->base);
+        }
     if (!err) {
-        for (chosen = 0; s->set->w_sim < 0 && error[chosen] > hypot(1.03 * best, floor_percent);)
+        const double enough = hypot(best, hypot(floor_percent, 100 * floor_of_structure * left.structure));
+        log_debug("joint: views set aside %.4f %% at best, %.4f %% is as good (structure %.4f %%)", best, enough, 100 * left.structure);
+        for (chosen = 0; s->set->w_sim < 0 && error[chosen] > enough;)
             chosen++;
         if (s->set->w_sim >= 0)
             chosen = n - 1;
         photometric_state_copy(&s->p, &s->base, &at[chosen]);
         s->w_sim = weight[chosen];
         log_debug("joint: w_sim %.0e it is", s->w_sim);
-        if (s->set->planes)
+        for (int k = 0; !err && s->set->planes && k < 2; k++) {
+            struct photometric_error e;
             err = find_planes(s, plane_tolerance, plane_share * s->w_sim);
+            s->p.texel_step = stage1_step_for(s, COARSE_SAMPLES);
+            if (!err)
+                err = stage1_minimise(s, 8, 2e-3, NULL);
+            s->p.texel_step = stage1_step_for(s, FINE_SAMPLES);
+            if (!err)
+                err = photometric_evaluate(&s->p, &s->base, s->p.albedo == ALBEDO_FREE, &e);
+            if (!err)
+                err = stage1_measure(s, &s->base, aside, &e);
+            log_debug("joint: w_sim %.0e: views set aside %.4f %%", s->w_sim, photometric_rmse_percent(&e));
+        }
     }
     progress_end();
     for (int i = 0; i < MAX_STEPS; i++)
@@ -296,50 +313,35 @@ end:
 
 // ---- the answer -----------------------------------------------------------------------------------------------------------
 
-// Standard deviations from the final normal equations: sigma^2 A^-1, sigma from the residuals' own mean square.
+// Standard deviations, and whether what is left of the pictures is more than noise.
 static int uncertainty(struct stage1 *s, struct joint_result *out)
 {
     const size_t n = (size_t)s->layout.n;
-    double *A = calloc(n * n, sizeof(double)), *C = calloc(n * n, sizeof(double)), *g = calloc(n, sizeof(double)), cost;
-    int err = A && C && g ? 0 : -ENOMEM;
-    const double w_sim = s->w_sim;
-    if (s->in_distance)
-        s->w_sim = 0;
+    double *prior = calloc(n * n, sizeof(double)), deviation[n];
+    struct photometric_error e;
+    int err = prior ? 0 : -ENOMEM;
     s->p.texel_step = stage1_step_for(s, FINE_SAMPLES);
-    if (!err)
-        err = stage1_normal_equations(s, &cost, A, g);
-    s->w_sim = w_sim;
     if (!err) {
-        struct photometric_error e;
+        stage1_add_prior(s, prior);
+        for (size_t i = 0; i < n; i++) // both triangles
+            for (size_t j = 0; j < i; j++)
+                prior[j * n + i] = prior[i * n + j];
+        err = misfit_deviations(deviation, &out->inflation, &s->p, &s->base, s->is_free, prior);
+    }
+    if (!err)
+        err = misfit_measure(&out->misfit, &s->p, &s->base);
+    if (!err)
         err = stage1_measure(s, &s->base, s->p.use_view, &e);
+    if (!err) {
         out->objective = 2 * e.cost / fmax(3 * (double)e.n, 1);
-        // A is of the mean of squares: covariance = sigma^2 / n_residuals A^-1.
-        unsigned char is_free[n];
-        for (size_t i = 0; i < n; i++)
-            is_free[i] = s->is_free[i] && A[i * n + i] > 0;
-        for (size_t i = 0; i < n; i++)
-            A[i * n + i] *= 1 + 1e-12;
-        const int singular = lm_inverse((int)n, A, is_free, C);
-        const double scale = singular ? NAN : out->objective / fmax(3 * (double)e.n, 1);
-        double deviation[n]; // infinite: nothing depends on it
-        for (size_t i = 0; i < n; i++)
-            deviation[i] = is_free[i] ? sqrt(scale * C[i * (n + 1)]) : INFINITY;
         memcpy(out->theta_std, deviation + s->layout.theta, sizeof(out->theta_std));
         memcpy(out->centre_std_m, deviation + s->layout.centre, sizeof(out->centre_std_m));
         memcpy(out->rotation_std_rad, deviation + s->layout.rotation, sizeof(out->rotation_std_rad));
         memcpy(out->inverse_distance_std, deviation + s->layout.inverse_distance, (size_t)s->p.n_groups * sizeof(double));
     }
     s->p.texel_step = 1;
-    free(A);
-    free(C);
-    free(g);
+    free(prior);
     return err;
-}
-
-static int by_double(const void *a, const void *b)
-{
-    const double x = *(const double *)a, y = *(const double *)b;
-    return (x > y) - (x < y);
 }
 
 static void doubt(const struct stage1 *s, struct joint_result *out, int n_fit_views)
@@ -348,19 +350,20 @@ static void doubt(const struct stage1 *s, struct joint_result *out, int n_fit_vi
         out->doubts |= DOUBT_FEW_VIEWS;
     if (s->set->method == METHOD_DIRECTIONAL)
         return;
-    double relative[s->p.n_groups];
+    double sum = 0;
     int n = 0;
-    for (int g = 0; g < s->p.n_groups; g++)
-        for (int i = 0; s->is_free[s->layout.inverse_distance + g] && i < s->base.lights.n; i++) // not those without light
-            if (s->p.group_of_light[i] == g) {
-                relative[n++] = out->inverse_distance_std[g] / s->base.lights.inverse_distance[i];
-                break;
-            }
-    qsort(relative, (size_t)n, sizeof(double), by_double);
-    const double centre = vec3_norm(out->centre_std_m);
-    if (!(centre < .1) || !(n && relative[n / 2] < .15))
+    for (int g = 0, i = 0; g < s->p.n_groups; g++) {
+        for (; i < s->base.lights.n && s->p.group_of_light[i] < g; i++)
+            ;
+        if (s->is_free[s->layout.inverse_distance + g] && i < s->base.lights.n) { // not those without light
+            sum += out->inverse_distance_std[g] / s->base.lights.inverse_distance[i];
+            n++;
+        }
+    }
+    out->distance_std_relative = n ? sum / n : INFINITY;
+    if (!(vec3_norm(out->centre_std_m) < .1) || !(out->distance_std_relative < .15))
         out->doubts |= DOUBT_UNCERTAIN;
-    if (sqrt(out->objective) > .06)
+    if (misfit_is_poor(&out->misfit))
         out->doubts |= DOUBT_POOR_FIT;
 }
 
@@ -428,8 +431,7 @@ int joint_solve(struct joint_result *out, const struct texels *texels, const str
         out->n_jacobians = s.n_jacobians;
         out->n_evaluations = s.n_evaluations;
         out->w_sim = s.w_sim;
-        // the paper's is of the bright samples
-        out->w_sim_sum = set->method == METHOD_ALTERNATING ? set->w_sim : s.w_sim * s.n_residuals;
+        out->w_sim_sum = set->method == METHOD_ALTERNATING ? s.w_sim_sum : s.w_sim * s.n_residuals;
         out->stop_reason = s.stop ? s.stop : "";
         out->state = s.base;
         memset(&s.base, 0, sizeof(s.base));

@@ -6,6 +6,7 @@
 //   METHOD_JOINT        ours: albedo eliminated, 1/r, a coarse sweep for the start, continuation in w_sim stopped by views set aside
 //                       (SOLVER.md 4)
 #pragma once
+#include "solver/misfit.h"
 #include "solver/photometric.h"
 #include "solver/rays.h"
 
@@ -18,9 +19,9 @@ struct joint_settings {
     enum disney_variant variant;
     enum albedo_mode albedo;
     double given_albedo[3];  // ALBEDO_GIVEN
-    double start_distance_m; // of every light; 0: swept over .7 .. 4 m (joint)
-    double w_sim;            // alternating: weight of Eq. 11 beside the *sum* of squared residuals (paper). joint: the last weight of the
-                             // continuation, beside the *mean*; negative: stopped by the views set aside (default)
+    double start_distance_m; // of every light; 0: swept over .7 .. 4 m (joint); each light's own, 2 m where it has none (alternating)
+    double w_sim;            // weight of Eq. 11 beside the *mean* of squared residuals. alternating: 3e-9 (default), held. joint: the last
+                             // weight of the continuation; negative: stopped by the views set aside (default)
     bool visibility;         // trace shadows, and again when lights have moved
     bool planes;             // joint: lights that lie on one plane, if the views set aside accept it, stay on it
     bool robust;             // down-weight outliers in the last stage
@@ -33,8 +34,8 @@ enum joint_doubt { // why an answer is not to be trusted; bits
     DOUBT_NO_INFORMATION = 1, // diffuse with free albedo: nothing says how far the lights are; solved as directional
     DOUBT_FEW_VIEWS = 2,      // fewer than 3 views see the object
     DOUBT_MIRRORED = 4,       // the mirrored panorama explains the pictures better
-    DOUBT_UNCERTAIN = 8,      // the standard deviation of the centre is above 10 cm, or the distances' median above 15 %
-    DOUBT_POOR_FIT = 16,      // the residual is far above the noise: a light is missing, or something moved
+    DOUBT_UNCERTAIN = 8,      // the standard deviation of the centre is above 10 cm, or the distances' mean above 15 %
+    DOUBT_POOR_FIT = 16,      // what is left of the pictures has structure (misfit.h): a light is missing, or something moved
 };
 const char *joint_doubt_text(unsigned one_bit);
 
@@ -43,13 +44,15 @@ struct joint_result {
     double rmse_fit_percent, rmse_held_out_percent; // samples; -1: no view held out
     int64_t n_fit, n_held_out;
     int n_jacobians, n_evaluations;
-    double w_sim;                    // the last one, our normalisation (mean); w_sim_sum: the paper's (sum)
+    double w_sim;                    // the last one, our normalisation (mean); w_sim_sum: beside the sum
     double w_sim_sum;
     const char *stop_reason;
-    // Standard deviations from the final normal equations; infinite where nothing depends on an unknown. They know of
-    // noise, not of what the model lacks.
+    // Standard deviations (misfit_deviations); infinite where nothing depends on an unknown.
     double theta_std[DISNEY_N], centre_std_m[3], rotation_std_rad[3];
     double *inverse_distance_std;    // [groups] 1/m; owned
+    double distance_std_relative;    // mean over the lights
+    double inflation;                // of the distances' variances over independent samples
+    struct misfit misfit;            // what is left of the pictures
     double objective;                // mean squared residual of the fit
     unsigned doubts;                 // 0: trusted
 };

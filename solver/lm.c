@@ -137,7 +137,7 @@ static bool new_scratch(struct scratch *s, size_t n)
     return s->A && s->B && s->g && s->d && s->step && s->trial && s->minus_g && s->is_free;
 }
 
-static int evaluate(const struct lm_problem *p, struct scratch *s, const double *x, double *scale,
+static int evaluate(const struct lm_problem *p, struct scratch *s, const double *x, bool fresh_scale, double *scale,
                     struct lm_result *r)
 {
     const size_t n = (size_t)p->n;
@@ -146,7 +146,7 @@ static int evaluate(const struct lm_problem *p, struct scratch *s, const double 
     r->n_jacobians++;
     const int err = p->normal_equations(p->arg, x, &r->cost, s->A, s->g);
     for (size_t i = 0; !err && i < n; i++)
-        scale[i] = fmax(scale[i], s->A[i * n + i]);
+        scale[i] = fmax(fresh_scale ? 0 : scale[i], s->A[i * n + i]);
     return err;
 }
 
@@ -211,7 +211,7 @@ int lm_minimise(const struct lm_problem *p, const struct lm_settings *settings, 
     if (err)
         goto end;
     project(p, x);
-    err = evaluate(p, &s, x, scale, &r);
+    err = evaluate(p, &s, x, settings->fresh_scale, scale, &r);
     if (err)
         goto end;
     if (!isfinite(r.cost)) {
@@ -251,7 +251,7 @@ int lm_minimise(const struct lm_problem *p, const struct lm_settings *settings, 
             r.mu *= fmax(1. / 3, 1 - rho * rho * rho);
             r.mu = fmax(r.mu, 1e-15);
             nu = 2;
-            err = evaluate(p, &s, x, scale, &r);
+            err = evaluate(p, &s, x, settings->fresh_scale, scale, &r);
             if (err)
                 goto end;
             if (gain <= settings->relative_cost * before) {

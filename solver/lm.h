@@ -4,9 +4,10 @@
 // residuals need never be held. Damping by gain ratio (Madsen, Nielsen, Tingleff 2004): a step is taken when it gains more
 // than 1e-3 of what the model promised; a refused step multiplies mu by 2, 4, 8, ... Bounds: a variable at its bound whose
 // gradient points outwards is frozen for the step, and steps are projected (a change of variables would stall at the bounds).
-// Scaling is by the diagonal of A, the largest seen (Moré), so units of the variables do not matter.
+// Scaling is by the diagonal of A, the largest seen (Moré) unless settings say otherwise, so units of the variables do not matter.
 // Deterministic; not thread-safe per problem.
 #pragma once
+#include <stdbool.h>
 
 struct lm_problem {
     int n;
@@ -25,6 +26,8 @@ struct lm_settings {
     double relative_step;    // stop when |step| < this (|x| + this), scaled; 1e-9
     double gradient;         // stop when every free, scaled gradient entry is below this share of sqrt(2F); 1e-10
     double mu;               // first damping, a share of the scaled diagonal; 1e-3
+    bool fresh_scale;        // scale by the diagonal of A where x is (Marquardt), not by the largest seen (Moré); for problems with
+                             // places of enormous slope that one visit should not be remembered by
 };
 struct lm_settings lm_defaults(void);
 

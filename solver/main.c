@@ -17,6 +17,8 @@ static const struct {
     { "lights", command_lights, "cut a panorama into N lights" },
     { "visibility", command_visibility, "trace which cameras and lights see which texel" },
     { "render", command_render, "re-render views of a solved (or true) material" },
+    { "export", command_export, "write a solved material as GLB, MaterialX, OBJ or for Blender" },
+    { "report", command_report, "write a page for people about a solve" },
     { "compare", command_compare, "RMSE and PSNR of two pictures" },
     { "brdf", command_brdf, "evaluate the Disney BRDF and its derivatives for a table of cases" },
 };

@@ -154,9 +154,10 @@ struct job {
     int n_workers;
     bool fit;
     int n_free, *column;          // the compact place of each unknown, -1: not free
+    bool one_row;                 // diffuse, with neither gains nor albedos to find: a texel's views differ in a row's length only
     int *group_first;             // [n_groups + 1] where the lights of each group begin, when they are ascending and all groups are free; else NULL
     bool tinted;                  // the tint matters: solve the albedo twice
-    float (*residual)[3];         // [samples n] for the scale and the robust weights, or NULL
+    float (*residual)[3];         // [samples n] L - o, or NULL
 };
 
 static void job_free(struct job *j)
@@ -195,6 +196,9 @@ static int job_new(struct job *j, const struct photometric *p, struct photometri
         j->column[i] = is_free[i] ? j->n_free++ : -1;
     if (!j->column)
         goto fail;
+    j->one_row = p->model == REFLECT_LAMBERT && p->albedo != ALBEDO_FREE;
+    for (int v = 0; is_free && v < j->layout.n_views; v++)
+        j->one_row &= !is_free[j->layout.gain + v];
     bool ascending = is_free;
     for (int i = 0; ascending && i < s->lights.n; i++)
         ascending = (i == 0 || p->group_of_light[i] >= p->group_of_light[i - 1]);
@@ -369,7 +373,7 @@ static void evaluate_texels(void *arg, int64_t begin, int64_t end, int worker, d
                 partial[0] += .5 * (double)o->weight * (double)r * (double)r;
                 partial[1] += (double)shown * (double)shown;
                 if (j->residual)
-                    j->residual[i][c] = fabsf(r);
+                    j->residual[i][c] = r;
             }
             partial[2] += 1;
         }
@@ -476,6 +480,32 @@ VECTOR_CLONES static void project_rows(float *rows, size_t stride, int n, const 
     }
 }
 
+// One row for all views of a diffuse texel: as long as theirs together, with what their residuals have along it.
+static void add_diffuse(const struct job *j, struct worker *w, int n_seen, const float albedo[3], const struct shade_jacobian *d,
+                        const struct shade_setup *setup)
+{
+    for (int c = 0; c < 3; c++) {
+        double length2 = 0, along = 0;
+        for (int k = 0; k < n_seen; k++) {
+            struct observation *o = &w->seen[k];
+            const double gain = (double)o->gain, weighted = (double)o->weight * gain;
+            o->constant[c] = 0, o->own[c] = o->gain * d->own[c];
+            const float r = residual_of(o, c, albedo[c]);
+            if (o->clipped && r == 0)
+                continue;
+            length2 += weighted * gain;
+            along += weighted * (double)r;
+        }
+        if (!(length2 > 0))
+            continue;
+        const float length = (float)sqrt(length2);
+        float *row = normal_rows_next(&w->rows, (float)(along / (double)length));
+        fill_row(j, row, c, 0, 1, d, setup); // scaled afterwards, so as to round alike whichever loop sums a group's lights
+        for (int i = 0; i < j->n_free; i++)
+            row[i] *= length;
+    }
+}
+
 static void add_texels(void *arg, int64_t begin, int64_t end, int worker, double *partial)
 {
     struct job *j = arg;
@@ -509,6 +539,10 @@ static void add_texels(void *arg, int64_t begin, int64_t end, int worker, double
                     setup.centre[c][i] *= k, setup.rotation[c][i] *= k;
                 for (int i = 0; i < j->lights.n; i++)
                     setup.inverse_distance[c][i] *= k;
+            }
+            if (j->one_row) {
+                add_diffuse(j, w, n_seen, m.albedo, &d, &setup);
+                continue;
             }
         } else {
             j->kernels->gather(&w->lit, &j->lights, &point, visible_of(j->p, texel), NULL);
@@ -569,7 +603,15 @@ int photometric_normal_equations(const struct photometric *p, const struct photo
     return err;
 }
 
-// ---- robust weights -----------------------------------------------------------------------------------------------------
+// ---- residuals, robust weights -------------------------------------------------------------------------------------------
+
+int photometric_residuals(const struct photometric *p, const struct photometric_state *s, float (*residual)[3])
+{
+    struct photometric_error error;
+    for (int64_t i = 0; i < p->samples->n; i++)
+        residual[i][0] = residual[i][1] = residual[i][2] = NAN;
+    return evaluate(p, (struct photometric_state *)s, false, residual, &error);
+}
 
 static int by_float(const void *a, const void *b)
 {
@@ -577,54 +619,35 @@ static int by_float(const void *a, const void *b)
     return (x > y) - (x < y);
 }
 
-// |L - o| of every sample in use; -1 where it is not.
-static int residuals(const struct photometric *p, const struct photometric_state *s, float (**out)[3])
-{
-    struct photometric_error error;
-    float(*r)[3] = malloc((size_t)p->samples->n * sizeof(*r) + 1);
-    if (!r)
-        return -ENOMEM;
-    for (int64_t i = 0; i < p->samples->n; i++)
-        r[i][0] = r[i][1] = r[i][2] = -1;
-    const int err = evaluate(p, (struct photometric_state *)s, false, r, &error);
-    if (err)
-        free(r);
-    else
-        *out = r;
-    return err;
-}
-
 int photometric_scale(const struct photometric *p, const struct photometric_state *s, double *sigma)
 {
-    float(*r)[3];
-    const int err = residuals(p, s, &r);
-    if (err)
-        return err;
-    float *all = r[0];
-    int64_t n = 0;
-    for (int64_t i = 0; i < 3 * p->samples->n; i++)
-        if (all[i] >= 0)
-            all[n++] = all[i];
-    qsort(all, (size_t)n, sizeof(float), by_float);
-    *sigma = n ? 1.4826 * (double)all[n / 2] : 0;
+    float(*r)[3] = malloc((size_t)p->samples->n * sizeof(*r) + 1);
+    int err = r ? photometric_residuals(p, s, r) : -ENOMEM;
+    if (!err) {
+        float *all = r[0];
+        int64_t n = 0;
+        for (int64_t i = 0; i < 3 * p->samples->n; i++)
+            if (!isnan(all[i]))
+                all[n++] = fabsf(all[i]);
+        qsort(all, (size_t)n, sizeof(float), by_float);
+        *sigma = n ? 1.4826 * (double)all[n / 2] : 0;
+    }
     free(r);
-    return 0;
+    return err;
 }
 
 int photometric_robust_weights(const struct photometric *p, const struct photometric_state *s, double sigma,
                                const float *base, float *weight)
 {
-    float(*r)[3];
+    float(*r)[3] = malloc((size_t)p->samples->n * sizeof(*r) + 1);
     struct photometric plain = *p;
     plain.weight = NULL;
-    const int err = residuals(&plain, s, &r);
-    if (err)
-        return err;
-    for (int64_t i = 0; i < p->samples->n; i++) {
-        const float largest = fmaxf(fmaxf(r[i][0], r[i][1]), r[i][2]);
+    const int err = r ? photometric_residuals(&plain, s, r) : -ENOMEM;
+    for (int64_t i = 0; !err && i < p->samples->n; i++) {
+        const float largest = fmaxf(fmaxf(fabsf(r[i][0]), fabsf(r[i][1])), fabsf(r[i][2]));
         const double u = (double)largest / (sigma > 0 ? sigma : 1), w = 1 / (1 + u * u);
-        weight[i] = largest < 0 ? 0 : (float)(w * w) * (base ? base[i] : 1);
+        weight[i] = isnan(r[i][0]) ? 0 : (float)(w * w) * (base ? base[i] : 1);
     }
     free(r);
-    return 0;
+    return err;
 }

@@ -75,6 +75,9 @@ int photometric_evaluate(const struct photometric *p, struct photometric_state *
 int photometric_normal_equations(const struct photometric *p, const struct photometric_state *s,
                                  const unsigned char *is_free, double *A, double *g);
 
+// L - o of every sample into residual[samples n], with the albedo as it is; NAN: not in use; 0: clipped, and the model is brighter still. 0 or -ENOMEM.
+int photometric_residuals(const struct photometric *p, const struct photometric_state *s, float (*residual)[3]);
+
 // The weighted residuals' own scale: median of |L - o| over channels and samples in use, times 1.4826. 0 or -ENOMEM.
 int photometric_scale(const struct photometric *p, const struct photometric_state *s, double *sigma);
 // Robust weights (Geman-McClure) for residuals r = max over channels |L - o| at scale `sigma`, times `base` (NULL: 1) into weight[samples n].

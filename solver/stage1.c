@@ -62,6 +62,8 @@ static int find_pairs(struct stage1 *s, const struct lights *l)
     return err;
 }
 
+static const double similarity_on_planes = .1;
+
 // u(x): log(1/r), or r itself in paper mode; and du/dx.
 static double similarity_of(const struct stage1 *s, double x, double *slope)
 {
@@ -80,10 +82,10 @@ static double add_similarity(const struct stage1 *s, const double *x, double *A,
     double cost = 0;
     for (int k = 0; s->w_sim > 0 && k < s->n_pairs; k++) {
         const int i = first + s->pairs[k].i, j = first + s->pairs[k].j;
-        if (s->emitters.n && s->emitters.of[i - first] >= 0 && s->emitters.of[j - first] >= 0)
-            continue; // their planes say more
         double si, sj;
-        const double w = s->w_sim * s->pairs[k].weight;
+        // Of lights on planes, these say more; but a plane that the pictures hardly see must not drift off either.
+        const bool on_planes = s->emitters.n && s->emitters.of[i - first] >= 0 && s->emitters.of[j - first] >= 0;
+        const double w = (on_planes ? similarity_on_planes : 1) * s->w_sim * s->pairs[k].weight;
         const double e = similarity_of(s, x[i], &si) - similarity_of(s, x[j], &sj);
         cost += .5 * w * e * e;
         if (!A)
@@ -223,6 +225,23 @@ static int normal_callback(void *arg, const double *x, double *cost, double *A, 
     return 0;
 }
 
+void stage1_add_prior(const struct stage1 *s, double *P)
+{
+    const int n = s->layout.n;
+    struct stage1 known = *s;
+    double g[n];
+    memset(g, 0, sizeof(g));
+    if (s->set->method == METHOD_DIRECTIONAL)
+        return;
+    known.in_distance = false;
+    known.w_sim = 1. / N_NEIGHBOURS;
+    known.w_plane = s->w_sim > 0 ? s->w_plane / s->w_sim * known.w_sim : 0;
+    photometric_pack(&s->p, &s->base, s->x);
+    add_similarity(&known, s->x, P, g);
+    for (int v = 0; s->set->gain && v < s->layout.n_views; v++)
+        P[(size_t)(s->layout.gain + v) * n + s->layout.gain + v] += gain_precision();
+}
+
 int stage1_normal_equations(struct stage1 *s, double *cost, double *A, double *g)
 {
     const bool in_distance = s->in_distance;
@@ -295,6 +314,8 @@ int stage1_minimise(struct stage1 *s, int max_iterations, double relative_cost, 
     double scratch[s->layout.n];
     settings.max_iterations = max_iterations;
     settings.relative_cost = relative_cost;
+    if (s->in_distance) // radiance is far from linear in r, and a light that comes near the object changes everything
+        settings.mu = 10, settings.fresh_scale = true;
     photometric_pack(&s->p, &s->base, s->x);
     for (int g = 0; s->in_distance && g < s->p.n_groups; g++)
         s->x[s->layout.inverse_distance + g] = 1 / s->x[s->layout.inverse_distance + g];

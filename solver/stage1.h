@@ -19,6 +19,7 @@ struct stage1 {
     float *ratio;                         // [lights] of p.ratio_of_light
     bool in_distance;         // the unknown is r, not 1/r, and E_sim is Eq. 11 to the letter (paper)
     double w_sim;             // beside the mean of squares
+    double w_sim_sum;         // alternating: the same beside the sum, of the samples that are fitted
     double first_centre_m[3]; // joint: the centre is held near its first guess with the same weight, which ends at (nearly) 0
     double n_residuals;       // samples x 3 in use
     unsigned char *is_free;   // [layout.n]
@@ -44,6 +45,9 @@ int stage1_trace_visibility(struct stage1 *s);
 int stage1_minimise(struct stage1 *s, int max_iterations, double relative_cost, double *cost);
 // The normal equations of the mean of squares + E_sim at base, in 1/r. A, g zeroed by the caller.
 int stage1_normal_equations(struct stage1 *s, double *cost, double *A, double *g);
+// What is known of the unknowns before any picture, as a precision added to P [n][n] (lower triangle): rooms (E_sim of log 1/r where a wall
+// seen at 45 degrees has a deviation of 1), planes where set, the centre's first guess, the cameras' gains.
+void stage1_add_prior(const struct stage1 *s, double *P);
 // The error of `use_view` under `state`, over the texels that the views in s->p saw: others have no albedo to be judged.
 int stage1_measure(const struct stage1 *s, const struct photometric_state *state, const uint8_t *use_view,
                    struct photometric_error *e);

@@ -46,7 +46,7 @@ gives 0 "help" "$rigsolve" --help
 gives 0 "version" "$rigsolve" --version
 gives 2 "no command is a usage error" "$rigsolve"
 gives 2 "an unknown command is a usage error" "$rigsolve" paint
-for c in brdf lights visibility synth solve render compare; do
+for c in brdf lights visibility synth solve render export report compare; do
     gives 0 "$c --help" "$rigsolve" $c --help
     gives 2 "$c without arguments is a usage error" "$rigsolve" $c
     gives 2 "$c with an unknown option is a usage error" "$rigsolve" $c --no-such-option
@@ -71,7 +71,7 @@ gives 0 "render of the truth by the take's cameras" "$rigsolve" render "$dir/one
     -o "$dir/views" --samples 1
 "$rigsolve" compare "$dir/views" "$dir/one/linear" --json >"$dir/compare.json" 2>"$dir/log"
 result $? "compare of two folders"
-json_has "$dir/compare.json" '$d->{rmse_percent} < .1 || print "RMSE $d->{rmse_percent} %\n"'
+json_has "$dir/compare.json" '$d->{rmse_percent} < .1 || do { print "RMSE $d->{rmse_percent} %\n"; 0 }'
 result $? "the render of the truth is what synth wrote, to the rounding of half floats"
 
 gives 0 "synth makes a diffuse studio" "$rigsolve" synth D2 -o "$dir/diffuse" --size 120x80 --views 20 --true-lights 4096 --texture 64 --samples 1
@@ -172,5 +172,60 @@ wait $pid 2>/dev/null
 : >"$dir/log"
 [ ! -e "$dir/killed" ]
 result $? "a killed synth leaves no folder that looks finished"
+
+# Export, turntable, report
+gives 0 "export in every format" "$rigsolve" export "$dir/one/truth" -o "$dir/export" --json
+json_has "$dir/log" '$d->{rmse_percent} > 0 && $d->{rmse_percent} < $d->{rmse_by_name_percent}'
+result $? "its summary says what the fit to glTF's reflectance costs, and that copying by name would cost more"
+[ -s "$dir/export/model.glb" ] && [ -s "$dir/export/model.mtlx" ] && [ -s "$dir/export/model.obj" ] && [ -s "$dir/export/model.mtl" ] &&
+    [ -s "$dir/export/albedo.exr" ] && [ -s "$dir/export/lights.json" ] && json_has "$dir/export/export.json" '@{$d->{formats}} == 4'
+result $? "export leaves a file for each"
+gives 0 "the GLB is a mesh that visibility reads" "$rigsolve" visibility --mesh "$dir/export/model.glb" --cameras "$cameras" -o "$dir/glbvis" --texture 32
+gives 2 "export names a format it does not know" "$rigsolve" export "$dir/one/truth" -o "$dir/refused" --formats glb,fbx
+refuses "export says which folder has no solve" 'nowhere' "$rigsolve" export "$dir/nowhere" -o "$dir/refused"
+refuses "export says which mesh is gone" 'gone\.obj' "$rigsolve" export "$dir/one/truth" -o "$dir/refused" --mesh "$dir/gone.obj"
+gives 0 "export into the solve's own folder" "$rigsolve" export "$dir/solve" --formats glb,mtlx
+cmp "$dir/solve/albedo.exr" "$dir/solve3/albedo.exr" >"$dir/log" 2>&1 && [ -s "$dir/solve/model.glb" ]
+result $? "whose albedo stays as it was"
+# A quarter turn of the object before a camera that stands still, once by --turntable, once by a mesh that was turned.
+perl -ne 'push @l, $_; if (/^v (\S+) (\S+) (\S+)/) { for my $k (0, 1) { my $x = ($1, $2)[$k]; $a[$k] = $x if !defined $a[$k] || $x < $a[$k]; $b[$k] = $x if !defined $b[$k] || $x > $b[$k] } }
+    END { my @c = map { ($a[$_] + $b[$_]) / 2 } 0, 1; for (@l) { if (/^v (\S+) (\S+) (\S+)/) { printf "v %.9g %.9g %.9g\n", $c[0] - ($2 - $c[1]), $c[1] + ($1 - $c[0]), $3 }
+        elsif (/^vn (\S+) (\S+) (\S+)/) { printf "vn %.9g %.9g %.9g\n", -$2, $1, $3 } else { print } } }' "$dir/one/geometry/mesh.obj" >"$dir/turned.obj"
+gives 0 "render on a turntable" "$rigsolve" render "$dir/one/truth" --turntable 4 --cameras "$cameras" -o "$dir/turn" --samples 1
+gives 0 "render of the turned mesh" "$rigsolve" render "$dir/one/truth" --mesh "$dir/turned.obj" --cameras "$cameras" -o "$dir/turned" --samples 1
+"$rigsolve" compare "$dir/turn/turn001.exr" "$dir/turned/cam000.exr" --json >"$dir/compare.json" 2>"$dir/log"
+json_has "$dir/compare.json" '$d->{rmse_percent} < .2 || do { print "RMSE $d->{rmse_percent} %\n"; 0 }'
+result $? "a turntable turns the object against the clock, before camera and light that stand still"
+"$rigsolve" compare "$dir/turn/turn001.exr" "$dir/views/cam000.exr" --json >"$dir/compare.json" 2>"$dir/log"
+json_has "$dir/compare.json" '$d->{rmse_percent} > 1 || do { print "RMSE $d->{rmse_percent} %\n"; 0 }'
+result $? "and one that has turned looks different"
+gives 0 "a turntable finds a camera of its own" "$rigsolve" render "$dir/one/truth" --turntable 1 -o "$dir/own" --samples 1 --size 80x60
+gives 0 "light turned all the way round" "$rigsolve" render "$dir/one/truth" --cameras "$cameras" --turn-lights 360 -o "$dir/round" --samples 1
+"$rigsolve" compare "$dir/round/cam003.exr" "$dir/views/cam003.exr" --json >"$dir/compare.json" 2>"$dir/log"
+json_has "$dir/compare.json" '$d->{rmse_percent} < .01'
+result $? "is where it was"
+# The same object photographed under other light: by its lights, and by its panorama with the panels that say how far it is
+other="--cameras $dir/one/relit/cameras --samples 1"
+gives 0 "render under other lights" "$rigsolve" render "$dir/one/truth" $other --lights "$dir/one/relit/lights.json" -o "$dir/moved"
+"$rigsolve" compare "$dir/moved" "$dir/one/relit/linear" --json >"$dir/compare.json" 2>"$dir/log"
+json_has "$dir/compare.json" '$d->{rmse_percent} < .1 || do { print "RMSE $d->{rmse_percent} %\n"; 0 }'
+result $? "gives what was photographed there, to the rounding of half floats"
+gives 0 "render under another panorama" "$rigsolve" render "$dir/one/truth" $other --panorama "$dir/one/relit/panorama.exr" \
+    --world-from-probe "$dir/one/relit/probe.json" --panels "$dir/one/relit/panels.json" -n 256 -o "$dir/sky"
+"$rigsolve" compare "$dir/sky" "$dir/one/relit/linear" --json >"$dir/compare.json" 2>"$dir/log"
+json_has "$dir/compare.json" '$d->{rmse_percent} < .5 || do { print "RMSE $d->{rmse_percent} %\n"; 0 }'
+result $? "gives it too, but for the cut into 256 lights"
+gives 2 "render without cameras or turntable is a usage error" "$rigsolve" render "$dir/one/truth" -o "$dir/refused"
+gives 0 "report with the take's photographs" "$rigsolve" report "$dir/solve" --take "$dir/diffuse"
+[ "$(grep -c 'the photograph' "$dir/solve/report.html")" = 4 ] && ! grep -qE '<script|http' "$dir/solve/report.html"
+result $? "shows four of them and needs nothing but itself"
+perl -MJSON::PP -0777 -ne '$d = decode_json($_); $d->{views_held_out} = ["cam006"]; print encode_json($d)' "$dir/solve/report.json" >"$dir/solve3/report.json"
+gives 0 "report of a solve that set a view aside" "$rigsolve" report "$dir/solve3" --take "$dir/diffuse"
+grep -q '<h3>cam006 <small>(set aside' "$dir/solve3/report.html"
+result $? "shows that view, and says so"
+gives 0 "report without a take" "$rigsolve" report "$dir/solve0" -o "$dir/bare.html"
+grep -q 'not to be trusted' "$dir/bare.html" && ! grep -q 'the photograph' "$dir/bare.html"
+result $? "shows none, and says when not to believe a result"
+refuses "report says which folder has no solve" 'nowhere' "$rigsolve" report "$dir/nowhere" -o "$dir/refused"
 echo "1..$n"
 exit $failed

@@ -121,6 +121,31 @@ static void stays_inside_bounds_and_finds_the_constrained_minimum(void **state)
     assert_true(fabs(x[0] - .5) < 1e-12 && fabs(x[1] - .25) < 1e-6);
 }
 
+// r = e^x - 1: where the search starts the slope is e^12, at the minimum 1.
+static void cliff(const double *x, double *r, double J[MAX_M][MAX_N])
+{
+    r[0] = exp(x[0]) - 1;
+    J[0][0] = exp(x[0]);
+}
+
+// Moré's scale remembers the cliff for good and holds back every later step; that of the current point does not.
+static void a_fresh_scale_forgets_a_cliff(void **state)
+{
+    (void)state;
+    struct residuals p = { 1, 1, cliff, NULL, NULL };
+    const struct lm_problem problem = { 1, NULL, NULL, cost, normal_equations, &p };
+    struct lm_settings s = lm_defaults();
+    struct lm_result remembering, fresh;
+    double x[2] = { 12, 12 };
+    s.max_iterations = 500, s.relative_cost = 0, s.mu = 10;
+    assert_int_equal(lm_minimise(&problem, &s, &x[0], &remembering), 0);
+    s.fresh_scale = true;
+    assert_int_equal(lm_minimise(&problem, &s, &x[1], &fresh), 0);
+    print_message("# %d Jacobians to %g, %d to %g\n", remembering.n_jacobians, x[0], fresh.n_jacobians, x[1]);
+    assert_true(fabs(x[0]) < 1e-6 && fabs(x[1]) < 1e-6);
+    assert_true(fresh.n_jacobians + 5 < remembering.n_jacobians);
+}
+
 // A minimum inside, the start on a bound that is not active there: the bound must be left again.
 static void leaves_a_bound_it_started_on(void **state)
 {
@@ -418,6 +443,7 @@ int main(void)
         cmocka_unit_test(follows_rosenbrocks_valley),
         cmocka_unit_test(reaches_powells_singular_minimum),
         cmocka_unit_test(stays_inside_bounds_and_finds_the_constrained_minimum),
+        cmocka_unit_test(a_fresh_scale_forgets_a_cliff),
         cmocka_unit_test(leaves_a_bound_it_started_on),
         cmocka_unit_test(does_not_mind_units),
         cmocka_unit_test(a_variable_without_influence_stays),

@@ -1,10 +1,12 @@
 # bash completion for rigsolve: commands, then each command's own long options as its --help lists them.
 _rigsolve() {
-    local cur=${COMP_WORDS[COMP_CWORD]}
+    local cur=${COMP_WORDS[COMP_CWORD]} before=${COMP_WORDS[COMP_CWORD - 1]}
     if [ "$COMP_CWORD" = 1 ]; then
         mapfile -t COMPREPLY < <(compgen -W "$(rigsolve --help | sed -n 's/^  \([a-z]*\) .*/\1/p') --help --version" -- "$cur")
     elif [[ $cur == -* ]]; then
         mapfile -t COMPREPLY < <(compgen -W "$(rigsolve "${COMP_WORDS[1]}" --help 2>/dev/null | grep -oE -- '--[a-z-]+' | sort -u)" -- "$cur")
+    elif [ "$before" = --formats ]; then # any of them, with commas between
+        mapfile -t COMPREPLY < <(compgen -P "${cur%"${cur##*,}"}" -W "glb mtlx obj blender" -- "${cur##*,}")
     elif [ "${COMP_WORDS[1]}" = synth ] && [ "$COMP_CWORD" = 2 ]; then
         mapfile -t COMPREPLY < <(compgen -W "D1 D2 D3 D4 D5" -- "$cur")
     fi

@@ -12,3 +12,5 @@ int command_solve(int argc, char **argv);
 int command_synth(int argc, char **argv);
 int command_render(int argc, char **argv);
 int command_compare(int argc, char **argv);
+int command_export(int argc, char **argv);
+int command_report(int argc, char **argv);

@@ -1,13 +1,16 @@
 // solver/commands/render.c - rigsolve render: a solved (or true) material from new views, under its
 // own light or another.
 //
-// SOLVE_DIR holds albedo.exr, brdf.exr (absent: Lambertian), lights.json and report.json, which
-// names the mesh and may say how its pictures were made ("render": samples, shadows, ...). Options
-// beat the report.
+// SOLVE_DIR is what solved.h says; its report.json may also say how its pictures were made ("render":
+// samples, shadows, ...). Options beat the report.
+//
+// A turntable turns the object before a camera and lights that stand still. What is computed turns
+// camera and lights the other way about the object, which gives the same picture.
 #include "solver/cameras.h"
 #include "solver/commands/arguments.h"
 #include "solver/commands/commands.h"
 #include "solver/commands/output.h"
+#include "solver/commands/solved.h"
 #include "solver/panorama.h"
 #include "solver/render.h"
 #include "solver/take/atomic_file.h"
@@ -18,11 +21,10 @@
 
 #include <argp.h>
 #include <errno.h>
-#include <limits.h>
+#include <math.h>
 #include <stdio.h>
 #include <stdlib.h>
 #include <string.h>
-#include <unistd.h>
 
 enum {
     KEY_CAMERAS = 256,
@@ -31,6 +33,9 @@ enum {
     KEY_PROBE,
     KEY_PANELS,
     KEY_RADIUS,
+    KEY_TURNTABLE,
+    KEY_TURN_LIGHTS,
+    KEY_EXPOSURE,
     KEY_MESH,
     KEY_SIZE,
     KEY_SAMPLES,
@@ -44,11 +49,15 @@ enum {
     DEFAULT_SHADOW_RAYS = 2,
     MAX_SHADOW_RAYS = 256,
     MAX_BOUNCE_RAYS = 4096,
-    MAX_BOUNCE_TEXTURE = 4096
+    MAX_BOUNCE_TEXTURE = 4096,
+    MAX_TURNTABLE = 3600
 };
 
 static const struct argp_option options[] = {
-    {"cameras", KEY_CAMERAS, "PATH", 0, "The views to render: a camera file or folder; required",
+    {"cameras", KEY_CAMERAS, "PATH", 0, "The views to render: a camera file or folder; required without --turntable",
+     0},
+    {"turntable", KEY_TURNTABLE, "N", 0,
+     "N views turn000... of the object turning once about the vertical, before the first of --cameras or one that sees it whole",
      0},
     {"output", 'o', "DIR", 0, "Where <view>.exr and <view>.png go; required", 0},
     {"lights", KEY_LIGHTS, "FILE", 0, "Light it by this lights.json instead of SOLVE_DIR's", 1},
@@ -60,9 +69,12 @@ static const struct argp_option options[] = {
     {"panels", KEY_PANELS, "FILE", 0,
      "JSON with the panels' corners: a light is as far as the panel its ray meets", 1},
     {"radius", KEY_RADIUS, "M", 0, "Metres to lights that meet no panel (3); inf: directional", 1},
+    {"turn-lights", KEY_TURN_LIGHTS, "DEG", 0,
+     "Turn the light about the vertical through the object, against the clock from above", 1},
     {"mesh", KEY_MESH, "FILE", 0, "Instead of the mesh that report.json names", 2},
-    {"size", KEY_SIZE, "WxH", 0, "Pixels, instead of the cameras' own", 2},
+    {"size", KEY_SIZE, "WxH", 0, "Pixels, instead of the cameras' own (a turntable's own: 640x480)", 2},
     {"samples", KEY_SAMPLES, "N", 0, "Rays per pixel and side (2)", 2},
+    {"exposure", KEY_EXPOSURE, "EV", 0, "Stops by which the PNGs are made brighter (0)", 2},
     {"no-shadows", KEY_NO_SHADOWS, 0, 0, "The object does not shadow itself", 2},
     {"threads", KEY_THREADS, "N", 0, "Default: all cores. The result does not depend on it", 2},
     {"json", KEY_JSON, 0, 0, "Print a summary as JSON", 2},
@@ -71,8 +83,8 @@ static const struct argp_option options[] = {
 
 struct arguments {
     const char *solve_dir, *cameras, *output, *lights, *panorama, *probe, *panels, *mesh;
-    double radius_m;
-    int n_lights, width_px, height_px, samples, n_threads;
+    double radius_m, turn_lights_deg, exposure_ev;
+    int n_lights, width_px, height_px, samples, n_threads, n_turntable;
     bool no_shadows, json;
 };
 
@@ -107,6 +119,15 @@ static error_t parse(int key, char *text, struct argp_state *state)
         if (end == text || *end || !(a->radius_m > 0))
             argp_error(state, "--radius %s: expected metres above 0, or inf", text);
         return 0;
+    case KEY_TURNTABLE:
+        a->n_turntable = (int)argument_integer(state, "--turntable", text, 1, MAX_TURNTABLE);
+        return 0;
+    case KEY_TURN_LIGHTS:
+        a->turn_lights_deg = argument_number(state, "--turn-lights", text, "degrees", -360, 360);
+        return 0;
+    case KEY_EXPOSURE:
+        a->exposure_ev = argument_number(state, "--exposure", text, "stops", -40, 40);
+        return 0;
     case KEY_MESH:
         a->mesh = text;
         return 0;
@@ -133,8 +154,10 @@ static error_t parse(int key, char *text, struct argp_state *state)
     case ARGP_KEY_END:
         if (!a->solve_dir)
             argp_error(state, "which SOLVE_DIR?");
-        if (!a->cameras || !a->output)
-            argp_error(state, "--cameras and -o are needed");
+        if (!a->output)
+            argp_error(state, "-o is needed");
+        if (!a->cameras && !a->n_turntable)
+            argp_error(state, "--cameras or --turntable is needed");
         if (a->lights && a->panorama)
             argp_error(state, "--lights and --panorama: one light at a time");
         if (!a->panorama != !a->probe)
@@ -150,8 +173,8 @@ static error_t parse(int key, char *text, struct argp_state *state)
 static const struct argp argp = {
     options,
     parse,
-    "SOLVE_DIR --cameras PATH -o DIR",
-    "Re-render a solved material (or a synthetic studio's truth/) from given cameras.\v"
+    "SOLVE_DIR --cameras PATH -o DIR\nSOLVE_DIR --turntable N -o DIR",
+    "Re-render a solved material (or a synthetic studio's truth/) from given cameras or on a turntable.\v"
     "Without --lights or --panorama it is lit by SOLVE_DIR/lights.json. Pictures are linear EXR "
     "(R, G, B, A as 32-bit floats, "
     "not clipped) and PNG with the sRGB curve.",
@@ -163,11 +186,8 @@ static const struct argp argp = {
 // ---- what to render -----------------------------------------------------------------------------
 
 struct scene {
-    struct json *report; // NULL: none
-    struct mesh mesh;
+    struct solved solved; // its lights are those in use
     struct rays *rays;
-    struct image albedo, parameters;
-    struct lights lights;
     struct cameras cameras;
     struct render_material material;
     struct render_settings settings;
@@ -175,22 +195,9 @@ struct scene {
 
 static void scene_free(struct scene *s)
 {
-    json_free(s->report);
     rays_free(s->rays);
-    mesh_free(&s->mesh);
-    image_free(&s->albedo), image_free(&s->parameters);
-    lights_free(&s->lights);
+    solved_free(&s->solved);
     cameras_free(&s->cameras);
-}
-
-static int join(char path[PATH_MAX], const char *dir, const char *name)
-{
-    const int n = *name == '/' ? snprintf(path, PATH_MAX, "%s", name)
-                               : snprintf(path, PATH_MAX, "%s/%s", dir, name);
-    if (n < PATH_MAX)
-        return 0;
-    log_error("render: the path %s/%s is too long", dir, name);
-    return -ENAMETOOLONG;
 }
 
 // A whole number of the report's "render" object, if it is there and in range.
@@ -208,11 +215,10 @@ static int setting(const struct json *report, const char *key, int low, int high
 
 static void choose_settings(struct scene *s, const struct arguments *a)
 {
-    const struct json *r = s->report;
-    const int shadow_rays = s->lights.n <= EXACT_SHADOWS_UP_TO ? 0 : DEFAULT_SHADOW_RAYS;
+    const struct json *r = s->solved.report;
+    const int shadow_rays = s->solved.lights.n <= EXACT_SHADOWS_UP_TO ? 0 : DEFAULT_SHADOW_RAYS;
     int64_t seed = 0;
     bool shadows = true, nearest = false;
-    const char *variant;
     if (r && json_get_bool(r, "render.shadows", &shadows))
         shadows = true;
     if (r && json_get_bool(r, "render.nearest", &nearest))
@@ -229,62 +235,12 @@ static void choose_settings(struct scene *s, const struct arguments *a)
         .n_threads = a->n_threads,
     };
     s->material = (struct render_material){
-        .model = s->parameters.data ? REFLECT_DISNEY : REFLECT_LAMBERT,
-        .variant = DISNEY_2017,
-        .albedo = &s->albedo,
-        .parameters = s->parameters.data ? &s->parameters : NULL,
+        .model = s->solved.parameters.data ? REFLECT_DISNEY : REFLECT_LAMBERT,
+        .variant = s->solved.variant,
+        .albedo = &s->solved.albedo,
+        .parameters = s->solved.parameters.data ? &s->solved.parameters : NULL,
         .nearest = nearest,
     };
-    if (r && !json_get_string(r, "variant", &variant) &&
-        !strcmp(variant, disney_variant_name(DISNEY_2012)))
-        s->material.variant = DISNEY_2012;
-}
-
-static int read_texture(struct image *out, const char *path)
-{
-    int err = image_read(out, path);
-    if (err)
-        return err;
-    err = image_require_finite(out, NULL, path);
-    if (err)
-        image_free(out);
-    return err;
-}
-
-static int read_material(struct scene *s, const struct arguments *a)
-{
-    char path[PATH_MAX];
-    int err = join(path, a->solve_dir, "albedo.exr");
-    if (!err)
-        err = read_texture(&s->albedo, path);
-    if (!err)
-        err = join(path, a->solve_dir, "brdf.exr");
-    if (err || access(path, F_OK))
-        return err;
-    return read_texture(&s->parameters, path);
-}
-
-static int read_mesh(struct scene *s, const struct arguments *a)
-{
-    char path[PATH_MAX];
-    const char *name = a->mesh;
-    struct mesh_check check;
-    int err = 0;
-    if (!name) {
-        if (!s->report || json_get_string(s->report, "inputs.mesh", &name)) {
-            log_error("render: %s/report.json does not name a mesh (inputs.mesh); give --mesh",
-                      a->solve_dir);
-            return -ENOENT;
-        }
-        err = join(path, a->solve_dir, name);
-        name = path;
-    }
-    if (!err)
-        err = mesh_read(&s->mesh, &check, name);
-    if (err)
-        return err;
-    mesh_check_log(&check, &s->mesh, name);
-    return rays_new(&s->rays, &s->mesh);
 }
 
 // ---- light from a panorama ----------------------------------------------------------------------
@@ -387,51 +343,164 @@ static int cut_panorama(struct lights *out, const struct arguments *a)
 
 static int read_lights(struct scene *s, const struct arguments *a)
 {
-    char path[PATH_MAX];
     if (a->panorama)
-        return cut_panorama(&s->lights, a);
+        return cut_panorama(&s->solved.lights, a);
     if (a->lights)
-        return lights_read_json(&s->lights, a->lights);
-    const int err = join(path, a->solve_dir, "lights.json");
-    return err ? err : lights_read_json(&s->lights, path);
+        return lights_read_json(&s->solved.lights, a->lights);
+    const int err = solved_read_lights(&s->solved, a->solve_dir);
+    if (err == -ENOENT)
+        log_error("render: %s has no lights.json; give --lights or --panorama", a->solve_dir);
+    return err;
+}
+
+// ---- turning ------------------------------------------------------------------------------------
+
+struct turn {
+    double rotation[9], axis[3], centre_m[3]; // about the mesh's middle
+};
+
+// The axis is the world's, nearest to the probe's +Y.
+static void make_turn(struct turn *t, const struct scene *s, double angle_rad)
+{
+    const double *r = s->solved.lights.world_from_probe, up[3] = {r[1], r[4], r[7]};
+    double w[3];
+    int axis = 0;
+    for (int c = 0; c < 3; c++) {
+        axis = fabs(up[c]) > fabs(up[axis]) ? c : axis;
+        t->centre_m[c] = (s->solved.mesh.bounds_m[0][c] + s->solved.mesh.bounds_m[1][c]) / 2;
+    }
+    for (int c = 0; c < 3; c++)
+        t->axis[c] = c == axis ? copysign(1, up[axis]) : 0, w[c] = angle_rad * t->axis[c];
+    mat3_from_rotation_vector(t->rotation, w);
+}
+
+static void turn_point(const struct turn *t, double point_m[3])
+{
+    double away[3];
+    vec3_sub(away, point_m, t->centre_m);
+    mat3_mul_vec(point_m, t->rotation, away);
+    for (int c = 0; c < 3; c++)
+        point_m[c] += t->centre_m[c];
+}
+
+static void turn_lights(const struct turn *t, struct lights *l)
+{
+    turn_point(t, l->centre_m);
+    mat3_mul(l->world_from_probe, t->rotation, l->world_from_probe);
+}
+
+static void turn_camera(const struct turn *t, struct camera *c)
+{
+    double back[9];
+    for (int i = 0; i < 9; i++)
+        back[i] = t->rotation[3 * (i % 3) + i / 3];
+    turn_point(t, c->centre_m);
+    mat3_mul(c->cam_from_world, c->cam_from_world, back);
+    mat3_mul_vec(c->t_m, c->cam_from_world, c->centre_m);
+    for (int i = 0; i < 3; i++)
+        c->t_m[i] = -c->t_m[i];
+}
+
+// A camera that sees the whole object from a little above, where the world's first other axis points.
+static int make_camera(struct scene *s)
+{
+    const double field_rad = .6, elevation_rad = .3;
+    const double(*bounds)[3] = (const double(*)[3])s->solved.mesh.bounds_m;
+    struct camera *c = calloc(1, sizeof(*c));
+    struct turn t;
+    double diagonal[3], aside[3], centre_m[3];
+    if (!c)
+        return -ENOMEM;
+    make_turn(&t, s, 0);
+    vec3_sub(diagonal, bounds[1], bounds[0]);
+    const double distance_m = .55 * vec3_norm(diagonal) / sin(field_rad / 2);
+    for (int k = 0; k < 3; k++)
+        aside[k] = t.axis[0] != 0 ? k == 1 : k == 0;
+    for (int k = 0; k < 3; k++)
+        centre_m[k] = t.centre_m[k] + distance_m * (cos(elevation_rad) * aside[k] + sin(elevation_rad) * t.axis[k]);
+    *c = (struct camera){.name = "turntable", .width_px = 640, .height_px = 480, .cx = 320, .cy = 240};
+    c->fx = c->fy = 240 / tan(field_rad / 2);
+    camera_look_at(c, centre_m, t.centre_m, t.axis);
+    s->cameras = (struct cameras){.n = 1, .view = c};
+    return 0;
 }
 
 static int read_scene(struct scene *s, const struct arguments *a)
 {
-    char path[PATH_MAX];
-    int err = join(path, a->solve_dir, "report.json");
-    if (!err && !access(path, F_OK))
-        err = json_read(&s->report, path);
+    int err = solved_read(&s->solved, "render", a->solve_dir, a->mesh);
     if (!err)
-        err = read_material(s, a);
-    if (!err)
-        err = read_mesh(s, a);
+        err = rays_new(&s->rays, &s->solved.mesh);
     if (!err)
         err = read_lights(s, a);
     if (!err)
-        err = cameras_read(&s->cameras, a->cameras);
+        err = a->cameras ? cameras_read(&s->cameras, a->cameras) : make_camera(s);
     for (int i = 0; !err && a->width_px && i < s->cameras.n; i++)
         camera_resize(&s->cameras.view[i], a->width_px, a->height_px);
-    if (!err)
-        choose_settings(s, a);
-    return err;
+    if (err)
+        return err;
+    if (a->turn_lights_deg != 0) {
+        struct turn t;
+        make_turn(&t, s, a->turn_lights_deg * M_PI / 180);
+        turn_lights(&t, &s->solved.lights);
+    }
+    choose_settings(s, a);
+    return 0;
 }
 
 // ---- pictures -----------------------------------------------------------------------------------
 
-static int render_one(const struct renderer *renderer, const struct camera *camera, const char *dir)
+static int render_one(const struct renderer *renderer, const struct camera *camera, const struct arguments *a)
 {
     struct image image;
     int err = render_view(renderer, camera, &image);
     if (err)
         return err;
-    char *exr = output_path(dir, camera->name, "exr"), *png = output_path(dir, camera->name, "png");
+    char *exr = output_path(a->output, camera->name, "exr"), *png = output_path(a->output, camera->name, "png");
     err = exr && png ? image_write_exr(&image, exr, IMAGE_FLOAT, IMAGE_ZIP) : -ENOMEM;
     if (!err)
-        err = image_write_png_srgb(&image, png, 0);
+        err = image_write_png_srgb(&image, png, a->exposure_ev);
     free(exr);
     free(png);
     image_free(&image);
+    return err;
+}
+
+static int render_views(const struct scene *s, const struct arguments *a)
+{
+    struct renderer *renderer;
+    int err = renderer_new(&renderer, &s->solved.mesh, s->rays, &s->solved.lights, &s->material, &s->settings);
+    if (err)
+        return err;
+    progress_begin("render", s->cameras.n);
+    for (int i = 0; !err && i < s->cameras.n; i++, progress_add(1))
+        err = render_one(renderer, &s->cameras.view[i], a);
+    progress_end();
+    renderer_free(renderer);
+    return err;
+}
+
+// A step of the object against the clock, seen from above, is one of camera and lights with it.
+static int render_turntable(const struct scene *s, const struct arguments *a)
+{
+    const struct lights still = s->solved.lights;
+    int err = 0;
+    progress_begin("turntable", a->n_turntable);
+    for (int i = 0; !err && i < a->n_turntable; i++, progress_add(1)) {
+        struct lights lights = still; // its arrays are shared
+        struct camera camera = s->cameras.view[0];
+        struct renderer *renderer;
+        struct turn t;
+        make_turn(&t, s, -2 * M_PI * i / a->n_turntable);
+        turn_lights(&t, &lights);
+        turn_camera(&t, &camera);
+        snprintf(camera.name, sizeof(camera.name), "turn%03d", i);
+        err = renderer_new(&renderer, &s->solved.mesh, s->rays, &lights, &s->material, &s->settings);
+        if (err)
+            break;
+        err = render_one(renderer, &camera, a);
+        renderer_free(renderer);
+    }
+    progress_end();
     return err;
 }
 
@@ -439,16 +508,21 @@ static int print_summary(const struct scene *s, const struct arguments *a, doubl
 {
     struct json *doc = json_object(), *views = json_array();
     json_set_string(doc, "output", a->output);
-    json_set_int(doc, "n_views", s->cameras.n);
-    json_set_int(doc, "n_lights", s->lights.n);
-    json_set_string(doc, "model", s->parameters.data ? "disney" : "lambert");
+    json_set_int(doc, "n_views", a->n_turntable ? a->n_turntable : s->cameras.n);
+    json_set_int(doc, "n_lights", s->solved.lights.n);
+    json_set_string(doc, "model", s->solved.parameters.data ? "disney" : "lambert");
     json_set_int(doc, "samples", s->settings.samples);
     json_set_bool(doc, "shadows", s->settings.shadows);
     json_set_int(doc, "shadow_rays", s->settings.shadow_rays);
     json_set_int(doc, "bounce_rays", s->settings.bounce_rays);
     json_set_number(doc, "wall_s", wall_s);
-    for (int i = 0; i < s->cameras.n; i++)
+    for (int i = 0; !a->n_turntable && i < s->cameras.n; i++)
         json_append_string(views, s->cameras.view[i].name);
+    for (int i = 0; i < a->n_turntable; i++) {
+        char name[16];
+        snprintf(name, sizeof(name), "turn%03d", i);
+        json_append_string(views, name);
+    }
     json_set(doc, "views", views);
     return output_json("render", doc);
 }
@@ -457,25 +531,17 @@ int command_render(int argc, char **argv)
 {
     struct arguments a = {.radius_m = 3, .n_lights = 256};
     struct scene s = {0};
-    struct renderer *renderer = NULL;
     argp_parse(&argp, argc, argv, 0, 0, &a);
     const double begin_s = output_clock_s();
     int err = read_scene(&s, &a);
     if (!err)
         err = make_directories(a.output);
     if (!err)
-        err = renderer_new(&renderer, &s.mesh, s.rays, &s.lights, &s.material, &s.settings);
-    if (!err) {
-        progress_begin("render", s.cameras.n);
-        for (int i = 0; !err && i < s.cameras.n; i++, progress_add(1))
-            err = render_one(renderer, &s.cameras.view[i], a.output);
-        progress_end();
-    }
+        err = a.n_turntable ? render_turntable(&s, &a) : render_views(&s, &a);
     if (!err && a.json)
         err = print_summary(&s, &a, output_clock_s() - begin_s);
     if (err == -ENOMEM)
         log_error("render: out of memory");
-    renderer_free(renderer);
     scene_free(&s);
     return err ? EXIT_FAILED : EXIT_DONE;
 }

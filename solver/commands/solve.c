@@ -48,8 +48,8 @@ static const struct argp_option options[] = {
     { "reflectance", OPTION_REFLECTANCE, "NAME", 0, "disney (default) or lambert", 2 },
     { "albedo", OPTION_ALBEDO, "free|shared|VALUE", 0, "per texel (default), one unknown colour, or known", 2 },
     { "distance", OPTION_DISTANCE, "M", 0, "first distance of all lights (joint: swept; alternating: 2)", 2 },
-    { "w-sim", OPTION_W_SIM, "W", 0, "weight of the similarity term: alternating 1e-3 beside the sum of squares; joint: the last one, "
-      "beside their mean (default: chosen by views set aside)", 2 },
+    { "w-sim", OPTION_W_SIM, "W", 0, "weight of the similarity term beside the mean of squares: alternating 3e-9; joint: the last one "
+      "(default: chosen by views set aside)", 2 },
     { "no-planes", OPTION_NO_PLANES, 0, 0, "joint: do not look for lights that lie on one plane", 2 },
     { "no-visibility", OPTION_NO_VISIBILITY, 0, 0, "every light reaches every texel above its horizon", 2 },
     { "robust", OPTION_ROBUST, 0, 0, "down-weight outliers in the last stage", 2 },

@@ -8,6 +8,7 @@
 // hostile file cannot ask for gigabytes.
 #pragma once
 #include <stdbool.h>
+#include <stddef.h>
 #include <stdint.h>
 
 enum { IMAGE_NAME_MAX = 64, IMAGE_MAX_CHANNELS = 64 };
@@ -44,6 +45,8 @@ int image_write_exr(const struct image *image, const char *path, enum image_type
                     enum image_compression compression);
 // 8-bit PNG, n_channels 1 (grey), 3 or 4; pixels as they are (already encoded). Atomic. 0 or -errno (logged).
 int image_write_png(const char *path, int width, int height, int n_channels, const uint8_t *pixels);
+// The same as bytes in memory, malloc'd, for files that hold pictures. 0, -EINVAL, -ENOMEM (logged).
+int image_encode_png(uint8_t **bytes, size_t *n_bytes, int width, int height, int n_channels, const uint8_t *pixels);
 // Tone-mapped PNG of the first three (or the only) channel: value * 2^exposure_ev, clipped, sRGB curve.
 int image_write_png_srgb(const struct image *image, const char *path, double exposure_ev);
 

@@ -73,34 +73,63 @@ static int encode(struct png_job *job, int width, int height, int n_channels, co
     return 0;
 }
 
-int image_write_png(const char *path, int width, int height, int n_channels, const uint8_t *pixels)
+// To a stream; name is for messages.
+static int encode_to(FILE *stream, const char *name, int width, int height, int n_channels,
+                     const uint8_t *pixels)
 {
-    struct atomic_file f;
-    struct png_job job = { 0 };
+    struct png_job job = { .stream = stream };
     if (width < 1 || height < 1 || (n_channels != 1 && n_channels != 3 && n_channels != 4)) {
         log_error("image: %s not written: a PNG of %d x %d pixels and %d channels; expected 1, 3 "
                   "or 4 channels",
-                  path, width, height, n_channels);
+                  name, width, height, n_channels);
         return -EINVAL;
     }
-    int err = atomic_file_open(&f, path);
-    if (err)
-        return err;
-    job.stream = f.stream;
     job.png = png_create_write_struct(PNG_LIBPNG_VER_STRING, &job, keep_error, drop_warning);
     job.info = job.png ? png_create_info_struct(job.png) : NULL;
-    err = job.info ? encode(&job, width, height, n_channels, pixels) : -ENOMEM;
+    int err = job.info ? encode(&job, width, height, n_channels, pixels) : -ENOMEM;
     png_destroy_write_struct(&job.png, &job.info);
     if (err) {
         err = job.write_err ? job.write_err : err;
-        log_error("image: cannot write %s: %s", path,
+        log_error("image: cannot write %s: %s", name,
                   job.write_err    ? strerror(-job.write_err)
                   : job.message[0] ? job.message
                                    : strerror(-err));
+    }
+    return err;
+}
+
+int image_write_png(const char *path, int width, int height, int n_channels, const uint8_t *pixels)
+{
+    struct atomic_file f;
+    int err = atomic_file_open(&f, path);
+    if (err)
+        return err;
+    err = encode_to(f.stream, path, width, height, n_channels, pixels);
+    if (err) {
         atomic_file_abandon(&f);
         return err;
     }
     return atomic_file_commit(&f);
+}
+
+int image_encode_png(uint8_t **bytes, size_t *n_bytes, int width, int height, int n_channels,
+                     const uint8_t *pixels)
+{
+    char *memory = NULL;
+    size_t n = 0;
+    FILE *stream = open_memstream(&memory, &n);
+    *bytes = NULL, *n_bytes = 0;
+    if (!stream)
+        return -ENOMEM;
+    int err = encode_to(stream, "a picture in memory", width, height, n_channels, pixels);
+    if (fclose(stream) && !err)
+        err = -ENOMEM;
+    if (err) {
+        free(memory);
+        return err;
+    }
+    *bytes = (uint8_t *)memory, *n_bytes = n;
+    return 0;
 }
 
 static void read_bytes(png_structp png, png_bytep bytes, size_t n)
