@@ -691,7 +691,7 @@ static int simplify(struct search *s, const struct witnesses *w, struct region *
             err = test(s, w, simpler.theta, 0, -1, &error, NULL, NULL);
         if (err)
             break;
-        const bool plain_enough = !((double)(r->theta[p] - plain[p]) > 2 * (double)r->std[p]);
+        const bool plain_enough = !(r->theta[p] - plain[p] > 2 * unknown_misfit * r->std[p]);
         log_debug("regions: region %d without %s (%.3f +- %.3f): views aside %.4f -> %.4f %%", at, disney_parameter_names[p], (double)r->theta[p],
                   (double)r->std[p], 100 * sqrt(*error2), 100 * sqrt(error));
         if (error < better_without * *error2 || (plain_enough && error < worth_a_layer * *error2 + rounding2)) {
