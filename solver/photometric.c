@@ -186,7 +186,8 @@ static int job_new(struct job *j, const struct photometric *p, struct photometri
     j->layout = layout_of(p);
     j->n_workers = p->n_threads > 0 ? p->n_threads : parallel_n_cores();
     j->tinted = p->model == REFLECT_DISNEY && p->albedo == ALBEDO_FREE &&
-                s->theta[DISNEY_SPECULAR_TINT] * s->theta[DISNEY_SPECULAR] + s->theta[DISNEY_SHEEN_TINT] * s->theta[DISNEY_SHEEN] > 1e-4;
+                (p->theta_of_texel ||
+                s->theta[DISNEY_SPECULAR_TINT] * s->theta[DISNEY_SPECULAR] + s->theta[DISNEY_SHEEN_TINT] * s->theta[DISNEY_SHEEN] > 1e-4);
     if (light_arrays_new(&j->lights, &s->lights))
         return -ENOMEM;
     j->workers = calloc((size_t)j->n_workers, sizeof(*j->workers));
@@ -272,7 +273,7 @@ static void material_of(const struct job *j, int texel, struct shade_material *m
 {
     m->variant = j->p->variant;
     for (int i = 0; i < DISNEY_N; i++)
-        m->theta[i] = (float)j->s->theta[i];
+        m->theta[i] = j->p->theta_of_texel ? j->p->theta_of_texel[texel][i] : (float)j->s->theta[i];
     for (int c = 0; c < 3; c++)
         m->albedo[c] = j->p->albedo == ALBEDO_SHARED ? (float)j->s->shared_albedo[c] : j->s->albedo[texel][c];
 }

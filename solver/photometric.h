@@ -36,6 +36,7 @@ struct photometric {
     int texel_step;                 // only every so many texels (1: all): a coarse look costs less
     const uint8_t *use_texel;       // [n_texels] 0: left out; NULL: all
     const float *weight;            // [samples n], or NULL: 1
+    const float (*theta_of_texel)[DISNEY_N]; // [n_texels] in place of the state's theta, which then must not be free; NULL: one for all
     const uint16_t *visible;        // [n_texels][words], or NULL: everything
     int words_per_texel;
     int n_threads;

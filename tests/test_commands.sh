@@ -90,6 +90,36 @@ gives 3 "a diffuse object of unknown albedo: solved as far as it goes, not to be
     --reflectance lambert --texture 32 --lights 64
 gives 0 "render of what was solved" "$rigsolve" render "$dir/solve" --cameras "$dir/diffuse/geometry/cameras" -o "$dir/solved" --samples 1
 
+# Stage 2 under the true lights
+under="--lights-from $dir/one/truth/lights.json --texture 32"
+gives 0 "solve finds textures under lights that are given" "$rigsolve" solve "$dir/one" -o "$dir/textures" $under --threads 1
+json_has "$dir/textures/report.json" '($m = $d->{stages}{materials}) && $m->{rmse_fit_percent} < 1 && @{$m->{regions}} == 1 &&
+    abs($m->{regions}[0]{theta}{roughness} - .6) < .05 && $m->{regions}[0]{model}{roughness} =~ /^(tied|free)$/ && @{$m->{levels}} >= 6'
+result $? "one region, its roughness, every level reported"
+gives 0 "solve again with other threads" "$rigsolve" solve "$dir/one" -o "$dir/textures3" $under --threads 3
+for f in albedo brdf std validity; do cmp "$dir/textures/$f.exr" "$dir/textures3/$f.exr" || break; done >"$dir/log" 2>&1
+result $? "same textures, to the byte"
+gives 0 "the paper's plain fit" "$rigsolve" solve "$dir/one" -o "$dir/plain" $under --method alternating
+json_has "$dir/plain/report.json" '@{$d->{stages}{materials}{regions}} == 0'
+result $? "without regions"
+gives 2 "no stage 1 and nothing after it is a usage error" "$rigsolve" solve "$dir/one" -o "$dir/refused" --lights-from x --stage 1
+refuses "lights that are not there are named" 'nowhere\.json' "$rigsolve" solve "$dir/one" -o "$dir/refused" --lights-from "$dir/nowhere.json"
+# Killed at any moment: no file that is not whole, and a second run as if nothing had been
+mkdir "$dir/torn"
+for pause in .05 .2 .4 .8; do
+    "$rigsolve" solve "$dir/one" -o "$dir/torn" $under --threads 1 >"$dir/log" 2>&1 &
+    pid=$!
+    sleep $pause
+    kill -9 $pid 2>/dev/null
+    wait $pid 2>/dev/null
+    for f in albedo brdf std validity; do
+        [ ! -e "$dir/torn/$f.exr" ] || cmp "$dir/torn/$f.exr" "$dir/textures/$f.exr" >>"$dir/log" 2>&1 || pause=torn
+    done
+    [ $pause = torn ] && break
+done
+[ $pause = .8 ] && "$rigsolve" solve "$dir/one" -o "$dir/torn" $under --threads 1 >>"$dir/log" 2>&1 && cmp "$dir/torn/brdf.exr" "$dir/textures/brdf.exr" >>"$dir/log" 2>&1
+result $? "a solve that was killed leaves whole files or none, and runs again"
+
 # Input as it comes from the world
 head -c 2000 "$dir/one/panorama.exr" >"$dir/cut.exr"
 refuses "a truncated EXR is refused by name" 'cut\.exr' "$rigsolve" lights "$dir/cut.exr" -n 64 -o "$dir/refused"

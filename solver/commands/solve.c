@@ -2,6 +2,7 @@
 #include "solver/commands/arguments.h"
 #include "solver/commands/commands.h"
 #include "solver/commands/inputs.h"
+#include "solver/commands/solve_materials.h"
 #include "solver/joint.h"
 #include "solver/parallel.h"
 #include "solver/samples.h"
@@ -22,6 +23,7 @@
 struct settings {
     const char *out, *preset, *hold_out;
     struct joint_settings joint;
+    struct solve_materials materials;
     double w_sim;
     bool has_w_sim, no_visibility, no_planes, no_continuation, footprint_mean, json;
     int texture, n_lights, n_sub, n_threads;
@@ -38,7 +40,7 @@ enum {
 
 static const struct argp_option options[] = {
     { 0, 0, 0, 0, "Method", 2 },
-    { "preset", OPTION_PRESET, "NAME", 0, "preview (texture 128), standard (256, default) or final (512)", 2 },
+    { "preset", OPTION_PRESET, "NAME", 0, "preview (texture 128), standard (512, default) or final (2048)", 2 },
     { "method", OPTION_METHOD, "NAME", 0, "joint (default), alternating (the paper) or directional", 2 },
     { "texture", OPTION_TEXTURE, "N", 0, "N x N texels", 2 },
     { "lights", OPTION_LIGHTS, "N", 0, "lights with a distance of their own, a power of two (256)", 2 },
@@ -67,7 +69,7 @@ static const struct argp_option options[] = {
 static const char doc[] =
     "Find where the studio's lights are, one shared reflectance, and every texel's albedo.\v"
     "TAKE is a folder with geometry/, linear/, panorama.exr and start.json; or name the pieces one by one. Writes "
-    "DIR/lights.json, albedo.exr, brdf.exr, validity.exr and report.json; `rigsolve render DIR` makes pictures of it.\n\n"
+    "DIR/lights.json, albedo.exr, brdf.exr, std.exr, validity.exr and report.json; `rigsolve render DIR` makes pictures of it.\n\n"
     "Exit status: 0 done, 1 failed, 2 usage, 3 done, but the result is not to be trusted: the report says why.";
 
 static error_t parse_option(int key, char *text, struct argp_state *state)
@@ -77,6 +79,7 @@ static error_t parse_option(int key, char *text, struct argp_state *state)
     switch (key) {
     case ARGP_KEY_INIT:
         state->child_inputs[0] = &s->in;
+        state->child_inputs[1] = &s->materials;
         return 0;
     case OPTION_PRESET:
         s->preset = presets[argument_choice(state, "--preset", text, presets, 3)];
@@ -275,8 +278,8 @@ static struct json *numbers_by_name(const double *values)
     return o;
 }
 
-static struct json *make_report(const struct scene *scene, const struct settings *s, const struct joint_result *r, double wall,
-                                double stage_s)
+static struct json *make_report(const struct scene *scene, const struct settings *s, const struct joint_result *r, const struct materials *m,
+                                double wall, double stage_s, double materials_s)
 {
     struct rusage use;
     getrusage(RUSAGE_SELF, &use);
@@ -324,6 +327,8 @@ static struct json *make_report(const struct scene *scene, const struct settings
     json_set_number(stage1, "wall_s", stage_s);
     json_set_int(stage1, "iterations", r->n_jacobians);
     json_set(stages, "joint", stage1);
+    if (m->theta)
+        solve_report_materials(o, stages, m, materials_s);
     json_set(o, "stages", stages);
     char *mesh = realpath(s->in.mesh_path, NULL);
     json_set_string(inputs, "mesh", mesh ? mesh : s->in.mesh_path);
@@ -332,7 +337,8 @@ static struct json *make_report(const struct scene *scene, const struct settings
     return o;
 }
 
-static int write_result(const struct scene *scene, const struct settings *s, const struct joint_result *r, struct json *report)
+static int write_result(const struct scene *scene, const struct settings *s, const struct joint_result *r, const struct materials *m,
+                        struct json *report)
 {
     float theta[DISNEY_N];
     char *lights = NULL, *path = NULL;
@@ -357,11 +363,13 @@ static int write_result(const struct scene *scene, const struct settings *s, con
             albedo[t][c] = s->joint.albedo == ALBEDO_SHARED ? (float)r->state.shared_albedo[c] : r->state.albedo[t][c];
             seen[t][c] = (float)(scene->samples.first[t + 1] > scene->samples.first[t]);
         }
-    if (!err)
+    if (!err && m->theta)
+        err = solve_write_materials(m, &s->in.texels, s->out);
+    if (!err && !m->theta)
         err = write_texture(s, "albedo.exr", 3, NULL, NULL, (const float(*)[3])albedo);
-    if (!err)
+    if (!err && !m->theta)
         err = write_texture(s, "validity.exr", 3, NULL, NULL, (const float(*)[3])seen);
-    if (!err && s->joint.model == REFLECT_DISNEY)
+    if (!err && !m->theta && s->joint.model == REFLECT_DISNEY)
         err = write_texture(s, "brdf.exr", DISNEY_N, disney_parameter_names, theta, NULL);
     if (!err)
         err = json_write(report, path);
@@ -389,12 +397,13 @@ static void print_summary(const struct settings *s, const struct joint_result *r
 
 int command_solve(int argc, char **argv)
 {
-    const struct argp_child children[] = { { &inputs_argp, 0, NULL, 0 }, { 0 } };
+    const struct argp_child children[] = { { &inputs_argp, 0, NULL, 0 }, { &solve_materials_argp, 0, NULL, 0 }, { 0 } };
     const struct argp argp = { options, parse_option, "TAKE -o DIR\n--mesh M --cameras C --images DIR --panorama P -o DIR", doc,
                                children, 0, 0 };
     struct settings s = { .preset = "standard", .n_lights = 256, .hold_out = "every:7", .seed = 1 };
     struct scene scene = { 0 };
     struct joint_result result = { 0 };
+    struct materials materials = { 0 };
     const double begin = wall_s();
     argp_parse(&argp, argc, argv, 0, NULL, &s);
     const struct joint_settings defaults = joint_defaults(s.joint.method);
@@ -405,29 +414,39 @@ int command_solve(int argc, char **argv)
     s.joint.planes = defaults.planes && !s.no_planes;
     s.joint.continuation = !s.no_continuation;
     s.joint.n_threads = s.n_threads;
+    s.materials.no_visibility = s.no_visibility;
     if (!s.n_sub)
         s.n_sub = s.joint.method == METHOD_JOINT ? 4 : 1;
     if (!s.texture)
-        s.texture = !strcmp(s.preset, "preview") ? 128 : !strcmp(s.preset, "final") ? 512 : 256;
+        s.texture = !strcmp(s.preset, "preview") ? 128 : !strcmp(s.preset, "final") ? 2048 : 512;
     int err = load(&scene, &s);
     const double stage_begin = wall_s();
-    if (!err)
+    if (!err && s.materials.lights_from)
+        err = solve_read_lights(&result, &scene.lights, &s.materials, &s.in, &scene.samples, scene.held_out, s.joint.method, s.n_threads);
+    else if (!err)
         err = joint_solve(&result, &s.in.texels, &scene.samples, s.in.rays, &scene.lights, s.n_lights, scene.held_out,
                           &s.joint);
+    const double materials_begin = wall_s();
+    if (!err && s.materials.last_stage == 2 && s.joint.model == REFLECT_DISNEY && s.joint.albedo == ALBEDO_FREE)
+        err = solve_find_materials(&materials, &s.materials, &result, s.n_lights, &s.joint, &s.in, &scene.samples, scene.held_out, s.n_threads);
     if (!err) {
-        struct json *report = make_report(&scene, &s, &result, wall_s() - begin, wall_s() - stage_begin);
-        err = write_result(&scene, &s, &result, report);
+        const double now = wall_s();
+        struct json *report = make_report(&scene, &s, &result, &materials, now - begin, materials_begin - stage_begin, now - materials_begin);
+        err = write_result(&scene, &s, &result, &materials, report);
         if (!err && s.json) {
             char *text = json_text(report);
             puts(text ? text : "");
             free(text);
         } else if (!err) {
             print_summary(&s, &result);
+            if (materials.theta)
+                solve_print_materials(&materials);
         }
         json_free(report);
     }
     const int code = err ? EXIT_FAILED : result.doubts ? EXIT_NOT_TRUSTED : EXIT_DONE;
     joint_result_free(&result);
+    materials_free(&materials);
     free_scene(&scene);
     inputs_free(&s.in);
     return code;

@@ -1,0 +1,897 @@
+// solver/regions.c - dealing texels out to shared reflectances, merging those, and choosing what each texel may have for itself.
+#include "solver/regions.h"
+
+#include "solver/lm.h"
+#include "solver/packed.h"
+#include "solver/parallel.h"
+#include "solver/take/log.h"
+
+#include <errno.h>
+#include <stdlib.h>
+#include <string.h>
+
+const char *const parameter_freedom_names[3] = { "frozen", "tied", "free" };
+
+enum {
+    FIRST_REGIONS = 6,    // cut into so many before merging
+    WITNESSES = 192,      // texels a region is fitted to
+    DEAL_ROUNDS = 3,
+    PATCHES = 64,         // of the surface: within one, errors of the model go together
+    MOST_VIEWS = 2048,
+};
+static const double least_share = .03;       // a smaller region is dissolved: what borders and rims look like, mostly
+static const double worth_a_region = 1.10;   // squared error of views set aside, of one reflectance for two regions
+static const double worth_a_parameter = .97; // the same with a parameter free per texel
+static const double worth_a_layer = 1.01;    // the same without clearcoat, sheen, ...
+static const double better_without = .99;
+static const double rounding2 = 3e-4 * 3e-4; // what half floats and look-ups leave in any comparison: to gain less is to gain nothing
+static const float unknown_misfit = 1.5f; // errors that neither views nor patches show: measured on D3 (90 % intervals over seeds)
+static const double most_free_std = .15;
+static const double hold = 1e-3;             // draws what nothing determines towards where it started, beside the sum of squares
+static const double own_hold = .02;          // the same of one texel's own parameter
+
+// What a parameter is when nothing speaks for it.
+static const float plain[DISNEY_N] = { [DISNEY_SPECULAR] = .5f, [DISNEY_ROUGHNESS] = .5f, [DISNEY_CLEARCOAT_GLOSS] = .5f };
+
+struct search {
+    const struct texel_scene *scene;
+    struct texel_scene inner, aside;     // scene with two thirds of its views, and with the others
+    const struct level *level;
+    int32_t *texel;                      // [level n] the finest texel that speaks for it, -1: nobody
+    float (*albedo)[3];                  // [texels n]
+    struct texel_worker **worker;
+    int n_workers, n_threads;
+    uint8_t *region;                     // [level n]
+    float *cost;                         // [level n][REGIONS_MAX]
+    struct regions *out;
+};
+
+struct witnesses {
+    int n, node[WITNESSES];
+    int32_t texel[WITNESSES];
+};
+
+// Evenly spread over the nodes of the regions in `mask`; those amid their own kind first.
+static void call_witnesses(const struct search *s, unsigned mask, struct witnesses *w)
+{
+    const struct level *l = s->level;
+    w->n = 0;
+    for (int inner = 1; inner >= 0 && w->n < 16; inner--) {
+        int n = 0, seen = 0;
+        for (int pass = 0; pass < 2; pass++)
+            for (int i = 0; i < l->n; i++) {
+                bool amid = s->texel[i] >= 0 && (mask >> s->region[i] & 1);
+                for (int32_t m = l->first_neighbour[i]; inner && amid && m < l->first_neighbour[i + 1]; m++)
+                    amid = mask >> s->region[l->neighbour[m]] & 1;
+                if (!amid)
+                    continue;
+                if (!pass) {
+                    n++;
+                    continue;
+                }
+                const int keep = n < WITNESSES ? n : WITNESSES; // the k-th is kept where k keep / n rises
+                if ((int64_t)(seen + 1) * keep / n > (int64_t)seen * keep / n && w->n < WITNESSES) {
+                    w->node[w->n] = i;
+                    w->texel[w->n++] = s->texel[i];
+                }
+                seen++;
+            }
+        if (inner && w->n < 16)
+            w->n = 0; // a sliver: take its rim as well
+    }
+}
+
+// ---- one reflectance for many texels ------------------------------------------------------------------------------------
+
+struct shared_fit {
+    struct search *s;
+    const struct texel_scene *scene;
+    const struct witnesses *w;
+    uint16_t frozen;         // parameters that stay plain
+    float theta[DISNEY_N];
+};
+
+static void add_witnesses(void *arg, int64_t begin, int64_t end, int worker, double *partial)
+{
+    struct shared_fit *f = arg;
+    for (int64_t k = begin; k < end; k++) {
+        struct texel_sums sums = { 0 };
+        texel_fit(f->scene, f->s->worker[worker], f->w->texel[k], 0, f->theta, f->s->albedo[f->w->texel[k]], 1, &sums);
+        partial[0] += sums.cost;
+        for (int p = 0; p < DISNEY_N; p++)
+            partial[1 + p] += sums.g[p];
+        for (int p = 0; p < THETA_PACKED; p++)
+            partial[1 + DISNEY_N + p] += sums.H[p];
+    }
+}
+
+static int shared_equations(void *arg, const double *x, double *cost, double *A, double *g)
+{
+    struct shared_fit *f = arg;
+    double sums[1 + DISNEY_N + THETA_PACKED] = { 0 };
+    for (int p = 0; p < DISNEY_N; p++)
+        f->theta[p] = (float)x[p];
+    const int err = parallel_sum(f->s->n_threads, f->w->n, 4, add_witnesses, f, 1 + DISNEY_N + THETA_PACKED, sums);
+    *cost = sums[0];
+    for (int p = 0; p < DISNEY_N; p++) {
+        const double d = x[p] - (double)plain[p];
+        *cost += .5 * hold * d * d;
+        if (!A)
+            continue;
+        g[p] += sums[1 + p] + hold * d;
+        for (int q = 0; q <= p; q++)
+            A[p * DISNEY_N + q] += sums[1 + DISNEY_N + packed_at(p, q)] + (p == q ? hold : 0);
+    }
+    return err;
+}
+
+static int shared_cost(void *arg, const double *x, double *cost)
+{
+    return shared_equations(arg, x, cost, NULL, NULL);
+}
+
+static int fit_from(struct shared_fit *f, const float start[DISNEY_N], int most_iterations, double relative_cost,
+                    float theta[DISNEY_N], double *cost)
+{
+    static const double lower[DISNEY_N] = { 0 }, upper[DISNEY_N] = { 1, 1, 1, 1, 1, 1, 1, 1, 1, 1 };
+    double low[DISNEY_N], high[DISNEY_N], x[DISNEY_N];
+    const struct lm_problem problem = { .n = DISNEY_N, .lower = low, .upper = high, .cost = shared_cost,
+                                        .normal_equations = shared_equations, .arg = f };
+    struct lm_settings set = lm_defaults();
+    struct lm_result result = { 0 };
+    set.max_iterations = most_iterations, set.relative_cost = relative_cost;
+    for (int p = 0; p < DISNEY_N; p++) {
+        const bool frozen = f->frozen >> p & 1;
+        x[p] = frozen ? (double)plain[p] : fmin(fmax((double)start[p], .02), .98); // at a bound nothing moves
+        low[p] = frozen ? x[p] : lower[p], high[p] = frozen ? x[p] : upper[p];
+    }
+    const int err = lm_minimise(&problem, &set, x, &result);
+    *cost = result.cost;
+    for (int p = 0; p < DISNEY_N && !err; p++)
+        theta[p] = (float)x[p];
+    return err;
+}
+
+// theta: a guess in. Highlights have many wrong explanations, so from a few places: the guess, dielectrics and metals, dull and sharp.
+static int fit_shared(struct search *s, const struct texel_scene *scene, const struct witnesses *w, uint16_t frozen, bool anywhere,
+                      float theta[DISNEY_N])
+{
+    static const float starts[][2] = { { 0, .15f }, { 0, .35f }, { 0, .7f }, { 1, .2f }, { 1, .45f } }; // metallic, roughness
+    struct shared_fit f = { .s = s, .scene = scene, .w = w, .frozen = frozen };
+    float best[DISNEY_N];
+    double least;
+    if (!w->n)
+        return 0;
+    int err = fit_from(&f, theta, anywhere ? 8 : 30, 1e-5, best, &least);
+    for (size_t k = 0; !err && anywhere && k < sizeof(starts) / sizeof(*starts); k++) {
+        float from[DISNEY_N], to[DISNEY_N];
+        double cost;
+        memcpy(from, plain, sizeof(from));
+        from[DISNEY_METALLIC] = starts[k][0], from[DISNEY_ROUGHNESS] = starts[k][1];
+        err = fit_from(&f, from, 8, 1e-3, to, &cost);
+        if (!err && cost < least) {
+            least = cost;
+            memcpy(best, to, sizeof(best));
+        }
+    }
+    if (!err && anywhere)
+        err = fit_from(&f, best, 30, 1e-5, best, &least);
+    if (!err)
+        memcpy(theta, best, sizeof(best));
+    return err;
+}
+
+struct testing {
+    struct search *s;
+    const struct witnesses *w;
+    const float *theta;
+    uint16_t free_mask;  // parameters each texel has for itself
+    int candidate;       // whose standard deviation is asked for
+    float *std;          // [w->n]
+    float *error2;       // [w->n] mean squared error of each
+};
+
+// One texel's own values of the free parameters, drawn towards the region's. The standard deviation of the candidate.
+static void fit_own(const struct testing *t, struct texel_worker *worker, int k, float theta[DISNEY_N], float albedo[3])
+{
+    double mu = 1e-3, cost = INFINITY, H[THETA_PACKED] = { 0 }, g[DISNEY_N] = { 0 };
+    float trial[DISNEY_N], trial_albedo[3];
+    int n = 0;
+    memcpy(trial, theta, sizeof(trial)), memcpy(trial_albedo, albedo, sizeof(trial_albedo));
+    for (int iteration = 0; iteration < 8; iteration++) {
+        struct texel_sums sums = { 0 };
+        texel_fit(&t->s->inner, worker, t->w->texel[k], 0, trial, trial_albedo, 1, &sums);
+        for (int p = 0; p < DISNEY_N; p++) {
+            const double d = (double)(trial[p] - t->theta[p]);
+            sums.cost += .5 * own_hold * d * d;
+            sums.g[p] += own_hold * d;
+            sums.H[packed_at(p, p)] += own_hold;
+        }
+        const double gain = cost - sums.cost;
+        if (gain > 0) {
+            memcpy(theta, trial, sizeof(trial)), memcpy(albedo, trial_albedo, sizeof(trial_albedo));
+            memcpy(H, sums.H, sizeof(H)), memcpy(g, sums.g, sizeof(g));
+            cost = sums.cost, n = sums.n, mu = fmax(mu / 5, 1e-7);
+        } else {
+            mu *= 8;
+        }
+        if (gain > 0 && gain < 1e-4 * cost)
+            break;
+        double M[THETA_PACKED], x[DISNEY_N];
+        memcpy(M, H, sizeof(M));
+        for (int p = 0; p < DISNEY_N; p++) {
+            x[p] = -g[p];
+            const int at = packed_at(p, p);
+            M[at] += mu * M[at];
+            if ((t->free_mask >> p & 1) && !(theta[p] <= 0 && g[p] > 0) && !(theta[p] >= 1 && g[p] < 0))
+                continue;
+            for (int q = 0; q < DISNEY_N; q++)
+                M[packed_at(p, q)] = 0;
+            M[at] = 1, x[p] = 0;
+        }
+        if (!packed_factor(DISNEY_N, M))
+            break;
+        packed_solve(DISNEY_N, M, x);
+        memcpy(trial, theta, sizeof(trial)), memcpy(trial_albedo, albedo, sizeof(trial_albedo));
+        for (int p = 0; p < DISNEY_N; p++)
+            trial[p] = fminf(fmaxf(theta[p] + (float)x[p], 0), 1);
+    }
+    t->std[k] = INFINITY;
+    if (t->candidate < 0 || !n)
+        return;
+    for (int p = 0; p < DISNEY_N; p++)
+        for (int q = 0; q < DISNEY_N && !(t->free_mask >> p & 1); q++)
+            H[packed_at(p, q)] = p == q;
+    double x[DISNEY_N] = { 0 };
+    x[t->candidate] = 1;
+    if (packed_factor(DISNEY_N, H)) {
+        packed_solve(DISNEY_N, H, x);
+        t->std[k] = (float)sqrt(2 * cost / fmax(3 * n - 6, 3) * x[t->candidate]);
+    }
+}
+
+// partial: squares, samples of the views set aside, with the albedo of the others.
+static void test_witnesses(void *arg, int64_t begin, int64_t end, int worker, double *partial)
+{
+    const struct testing *t = arg;
+    for (int k = (int)begin; k < (int)end; k++) {
+        float theta[DISNEY_N], albedo[3];
+        struct texel_sums sums = { 0 };
+        struct texel_error error = { 0 };
+        memcpy(theta, t->theta, sizeof(theta));
+        memcpy(albedo, t->s->albedo[t->w->texel[k]], sizeof(albedo));
+        if (t->free_mask)
+            fit_own(t, t->s->worker[worker], k, theta, albedo);
+        else
+            texel_fit(&t->s->inner, t->s->worker[worker], t->w->texel[k], 0, theta, albedo, 1, &sums);
+        texel_measure(&t->s->aside, t->s->worker[worker], t->w->texel[k], theta, albedo, &error);
+        t->error2[k] = error.n ? (float)(error.squares / (3 * (double)error.n)) : 0;
+        partial[0] += error.squares, partial[1] += 3 * (double)error.n;
+    }
+}
+
+// Mean squared error of the views set aside. each[WITNESSES]: of every witness, or NULL.
+static int test(struct search *s, const struct witnesses *w, const float theta[DISNEY_N], uint16_t free_mask, int candidate, double *error2,
+                double *median_std, float *each)
+{
+    float std[WITNESSES], errors[WITNESSES];
+    struct testing t = { s, w, theta, free_mask, candidate, std, each ? each : errors };
+    double sums[2] = { 0 };
+    const int err = parallel_sum(s->n_threads, w->n, 4, test_witnesses, &t, 2, sums);
+    *error2 = sums[0] / fmax(sums[1], 1);
+    if (!err && median_std) { // by insertion
+        for (int k = 1; k < w->n; k++) {
+            const float x = std[k];
+            int at = k;
+            for (; at > 0 && std[at - 1] > x; at--)
+                std[at] = std[at - 1];
+            std[at] = x;
+        }
+        *median_std = w->n ? (double)std[w->n / 2] : INFINITY;
+    }
+    return err;
+}
+
+// ---- dealing out --------------------------------------------------------------------------------------------------------
+
+static void cost_nodes(void *arg, int64_t begin, int64_t end, int worker)
+{
+    struct search *s = arg;
+    for (int64_t i = begin; i < end; i++)
+        for (int r = 0; r < s->out->n; r++) {
+            float albedo[3];
+            struct texel_sums sums = { 0 };
+            s->cost[i * REGIONS_MAX + r] = 0;
+            if (s->texel[i] < 0)
+                continue;
+            memcpy(albedo, s->albedo[s->texel[i]], sizeof(albedo));
+            texel_fit(s->scene, s->worker[worker], s->texel[i], 0, s->out->region[r].theta, albedo, 1, &sums);
+            s->cost[i * REGIONS_MAX + r] = (float)(sums.cost / fmax(sums.n, 1));
+        }
+}
+
+static int by_float(const void *a, const void *b)
+{
+    const float x = *(const float *)a, y = *(const float *)b;
+    return (x > y) - (x < y);
+}
+
+// Each node to the cheapest region; `unit`: what disagreeing with a neighbour costs.
+static void deal(const struct level *l, const float *cost, int n_regions, float unit, uint8_t *region)
+{
+    for (int i = 0; i < l->n; i++) {
+        const float *c = cost + (size_t)i * REGIONS_MAX;
+        int best = 0;
+        for (int r = 1; r < n_regions; r++)
+            best = c[r] < c[best] ? r : best;
+        region[i] = (uint8_t)best;
+    }
+    for (int sweep = 0; sweep < 4; sweep++) // iterated conditional modes
+        for (int i = 0; i < l->n; i++) {
+            const float *c = cost + (size_t)i * REGIONS_MAX;
+            float best_cost = INFINITY;
+            int best = 0;
+            for (int r = 0; r < n_regions; r++) {
+                float sum = c[r];
+                for (int32_t m = l->first_neighbour[i]; m < l->first_neighbour[i + 1]; m++)
+                    sum += region[l->neighbour[m]] != r ? unit : 0;
+                if (sum < best_cost)
+                    best_cost = sum, best = r;
+            }
+            region[i] = (uint8_t)best;
+        }
+}
+
+static int deal_out(struct search *s)
+{
+    const struct level *l = s->level;
+    parallel_for(s->n_threads, l->n, 16, cost_nodes, s);
+    float *least = malloc(((size_t)l->n + 1) * sizeof(float));
+    if (!least)
+        return -ENOMEM;
+    int n = 0;
+    for (int i = 0; i < l->n; i++) {
+        if (s->texel[i] < 0)
+            continue;
+        least[n] = INFINITY;
+        for (int r = 0; r < s->out->n; r++)
+            least[n] = fminf(least[n], s->cost[(size_t)i * REGIONS_MAX + (size_t)r]);
+        n++;
+    }
+    qsort(least, (size_t)n, sizeof(float), by_float);
+    deal(l, s->cost, s->out->n, n ? .5f * least[n / 2] : 0, s->region);
+    free(least);
+    return 0;
+}
+
+static void count(struct search *s)
+{
+    for (int r = 0; r < s->out->n; r++)
+        s->out->region[r].n_texels = 0;
+    for (int i = 0; i < s->level->n; i++)
+        s->out->region[s->region[i]].n_texels++;
+}
+
+static void rename_region(struct search *s, int from, int to)
+{
+    for (int i = 0; i < s->level->n; i++)
+        if (s->region[i] == from)
+            s->region[i] = (uint8_t)to;
+}
+
+// Region r's nodes have gone elsewhere.
+static void drop(struct search *s, int r)
+{
+    const int last = --s->out->n;
+    if (r != last) {
+        rename_region(s, last, r);
+        s->out->region[r] = s->out->region[last];
+    }
+}
+
+static int fit_all(struct search *s, bool anywhere)
+{
+    int err = 0;
+    for (int r = 0; !err && r < s->out->n; r++) {
+        struct witnesses w;
+        call_witnesses(s, 1u << r, &w);
+        err = fit_shared(s, &s->inner, &w, 0, anywhere, s->out->region[r].theta);
+    }
+    return err;
+}
+
+// Nodes fall into FIRST_REGIONS by what the coarse solve found: k-means over metallic, specular, roughness and albedo.
+enum { N_FEATURES = 6 };
+
+static void features_of(const struct search *s, const float (*theta)[DISNEY_N], int i, float f[N_FEATURES])
+{
+    const float *a = s->albedo[s->texel[i]], sum = a[0] + a[1] + a[2] + 1e-3f;
+    f[0] = theta[i][DISNEY_METALLIC], f[1] = .5f * theta[i][DISNEY_SPECULAR], f[2] = 2 * theta[i][DISNEY_ROUGHNESS];
+    f[3] = .5f * sum / 3, f[4] = a[0] / sum, f[5] = a[2] / sum;
+}
+
+static float apart(const float a[N_FEATURES], const float b[N_FEATURES])
+{
+    float sum = 0;
+    for (int k = 0; k < N_FEATURES; k++)
+        sum += (a[k] - b[k]) * (a[k] - b[k]);
+    return sum;
+}
+
+static int nearest_of(const float f[N_FEATURES], float (*centre)[N_FEATURES], int n)
+{
+    int best = 0;
+    for (int k = 1; k < n; k++)
+        best = apart(f, centre[k]) < apart(f, centre[best]) ? k : best;
+    return best;
+}
+
+static int cut(struct search *s, const float (*theta)[DISNEY_N])
+{
+    const struct level *l = s->level;
+    float(*f)[N_FEATURES] = calloc((size_t)l->n + 1, sizeof(*f)), centre[FIRST_REGIONS][N_FEATURES] = { { 0 } };
+    int n_known = 0, n = 0;
+    if (!f)
+        return -ENOMEM;
+    for (int i = 0; i < l->n; i++) {
+        if (s->texel[i] < 0)
+            continue;
+        features_of(s, theta, i, f[i]);
+        for (int k = 0; k < N_FEATURES; k++)
+            centre[0][k] += f[i][k];
+        n_known++;
+    }
+    for (int k = 0; k < N_FEATURES; k++)
+        centre[0][k] /= (float)(n_known ? n_known : 1);
+    // Seeds far from those there are, but not the farthest of all: an outlier is no material.
+    float *far = malloc(((size_t)l->n + 1) * sizeof(float));
+    for (n = 1; far && n < FIRST_REGIONS && n_known > 16 * n; n++) {
+        int m = 0, chosen = -1;
+        for (int i = 0; i < l->n; i++)
+            if (s->texel[i] >= 0)
+                far[m++] = apart(f[i], centre[nearest_of(f[i], centre, n)]);
+        qsort(far, (size_t)m, sizeof(float), by_float);
+        const float wanted = far[m - 1 - m / 50];
+        for (int i = 0; i < l->n && chosen < 0; i++)
+            if (s->texel[i] >= 0 && apart(f[i], centre[nearest_of(f[i], centre, n)]) >= wanted)
+                chosen = i;
+        memcpy(centre[n], f[chosen], sizeof(centre[n]));
+    }
+    for (int round = 0; far && round < 12; round++) {
+        double sum[FIRST_REGIONS][N_FEATURES] = { { 0 } };
+        int members[FIRST_REGIONS] = { 0 };
+        for (int i = 0; i < l->n; i++) {
+            s->region[i] = 0;
+            if (s->texel[i] < 0)
+                continue;
+            s->region[i] = (uint8_t)nearest_of(f[i], centre, n);
+            members[s->region[i]]++;
+            for (int k = 0; k < N_FEATURES; k++)
+                sum[s->region[i]][k] += (double)f[i][k];
+        }
+        for (int r = 0; r < n; r++)
+            for (int k = 0; k < N_FEATURES && members[r]; k++)
+                centre[r][k] = (float)(sum[r][k] / members[r]);
+    }
+    s->out->n = n;
+    for (int r = 0; r < n; r++) {
+        double sum[DISNEY_N] = { 0 };
+        int members = 0;
+        for (int i = 0; i < l->n; i++)
+            if (s->region[i] == r && s->texel[i] >= 0) {
+                members++;
+                for (int p = 0; p < DISNEY_N; p++)
+                    sum[p] += (double)theta[i][p];
+            }
+        for (int p = 0; p < DISNEY_N; p++)
+            s->out->region[r].theta[p] = members ? (float)(sum[p] / members) : .5f;
+    }
+    free(f);
+    const int err = far ? 0 : -ENOMEM;
+    free(far);
+    return err;
+}
+
+static int dissolve_small(struct search *s)
+{
+    int err = 0;
+    count(s);
+    for (int r = s->out->n - 1; !err && r >= 0 && s->out->n > 1; r--) {
+        if (s->out->region[r].n_texels >= least_share * s->level->n)
+            continue;
+        for (int i = 0; i < s->level->n; i++) { // to the next best
+            if (s->region[i] != r)
+                continue;
+            const float *c = s->cost + (size_t)i * REGIONS_MAX;
+            int best = -1;
+            for (int q = 0; q < s->out->n; q++)
+                if (q != r && (best < 0 || c[q] < c[best]))
+                    best = q;
+            s->region[i] = (uint8_t)best;
+        }
+        drop(s, r);
+        err = deal_out(s);
+        count(s);
+    }
+    return err;
+}
+
+// By what factor the witnesses' errors grow from `alone` to `shared`: the mean over them of the logarithm, as texels are very unlike; and as
+// much less as could be chance (four standard errors).
+static double how_much_worse(const float *shared, const float *alone, int n)
+{
+    double sum = 0, squares = 0;
+    for (int k = 0; k < n; k++) {
+        const double worse = log(((double)shared[k] + rounding2) / ((double)alone[k] + rounding2));
+        sum += worse, squares += worse * worse;
+    }
+    if (n < 2)
+        return 1;
+    const double mean = sum / n, variance = fmax(squares / n - mean * mean, 0) / (n - 1);
+    return exp(mean - 4 * sqrt(variance));
+}
+
+// As long as two regions do as well under one reflectance, they are one.
+static int merge(struct search *s)
+{
+    int err = 0;
+    while (!err && s->out->n > 1) {
+        double least = INFINITY, error2;
+        float alone[REGIONS_MAX][WITNESSES];
+        struct witnesses w[REGIONS_MAX];
+        float best_theta[DISNEY_N];
+        int best_a = 0, best_b = 0;
+        for (int r = 0; !err && r < s->out->n; r++) {
+            call_witnesses(s, 1u << r, &w[r]);
+            err = test(s, &w[r], s->out->region[r].theta, 0, -1, &error2, NULL, alone[r]);
+        }
+        for (int a = 0; !err && a < s->out->n; a++)
+            for (int b = a + 1; !err && b < s->out->n; b++) {
+                struct witnesses both = { 0 }; // as many of either
+                float theta[DISNEY_N];
+                float one[WITNESSES], other[WITNESSES];
+                for (int k = 0; k < WITNESSES / 2 && k < w[a].n; k++)
+                    both.texel[both.n++] = w[a].texel[(int64_t)k * w[a].n / (w[a].n < WITNESSES / 2 ? w[a].n : WITNESSES / 2)];
+                for (int k = 0; k < WITNESSES / 2 && k < w[b].n; k++)
+                    both.texel[both.n++] = w[b].texel[(int64_t)k * w[b].n / (w[b].n < WITNESSES / 2 ? w[b].n : WITNESSES / 2)];
+                for (int p = 0; p < DISNEY_N; p++)
+                    theta[p] = .5f * (s->out->region[a].theta[p] + s->out->region[b].theta[p]);
+                err = fit_shared(s, &s->inner, &both, 0, false, theta);
+                if (!err)
+                    err = test(s, &w[a], theta, 0, -1, &error2, NULL, one);
+                if (!err)
+                    err = test(s, &w[b], theta, 0, -1, &error2, NULL, other);
+                const double ratio = err ? INFINITY : fmax(how_much_worse(one, alone[a], w[a].n), how_much_worse(other, alone[b], w[b].n));
+                if (!err && ratio < least) {
+                    least = ratio, best_a = a, best_b = b;
+                    memcpy(best_theta, theta, sizeof(theta));
+                }
+            }
+        if (!err && least > worth_a_region)
+            log_debug("regions: %d and %d of %d stay apart: views aside %.4f x", best_a, best_b, s->out->n, least);
+        if (err || least > worth_a_region)
+            break;
+        log_debug("regions: %d and %d of %d become one: views aside %.4f x", best_a, best_b, s->out->n, least);
+        rename_region(s, best_b, best_a);
+        memcpy(s->out->region[best_a].theta, best_theta, sizeof(best_theta));
+        drop(s, best_b);
+        err = fit_all(s, false);
+        if (!err)
+            err = deal_out(s);
+        if (!err)
+            err = dissolve_small(s);
+    }
+    return err;
+}
+
+// ---- what is free -------------------------------------------------------------------------------------------------------
+
+// Covariance of a region's theta, albedos eliminated: A^-1 B A^-1 with B the sum of squared scores by view and by patch of the surface:
+// what the model lacks goes together there, and noise does not know it.
+static int region_uncertainty(struct search *s, const struct witnesses *w, uint16_t frozen, struct region *r)
+{
+    double A[THETA_PACKED] = { 0 }, B[THETA_PACKED] = { 0 }, C[DISNEY_N][DISNEY_N] = { { 0 } };
+    const int n_views = s->scene->samples->n_views;
+    double(*by_view)[DISNEY_N] = calloc((size_t)n_views + 1, sizeof(*by_view)), (*by_patch)[DISNEY_N] = calloc(PATCHES, sizeof(*by_patch));
+    double(*J)[DISNEY_N] = malloc(3 * TEXEL_VIEWS_MAX * sizeof(*J));
+    int err = by_view && by_patch && J ? 0 : -ENOMEM;
+    for (int k = 0; !err && k < w->n; k++) {
+        const struct texel_row *rows;
+        struct texel_sums sums = { 0 };
+        texel_fit(s->scene, s->worker[0], w->texel[k], 0, r->theta, s->albedo[w->texel[k]], 1, &sums);
+        const int n = texel_rows(s->scene, s->worker[0], w->texel[k], r->theta, s->albedo[w->texel[k]], &rows);
+        double own[6] = { 1e-12, 0, 1e-12, 0, 0, 1e-12 }, mixed[DISNEY_N][3] = { { 0 } };
+        for (int i = 0; i < n; i++)
+            for (int a = 0; a < 3; a++) {
+                for (int b = 0; b <= a; b++)
+                    own[packed_at(a, b)] += (double)rows[i].J[DISNEY_N + a] * (double)rows[i].J[DISNEY_N + b];
+                for (int p = 0; p < DISNEY_N; p++)
+                    mixed[p][a] += (double)rows[i].J[DISNEY_N + a] * (double)rows[i].J[p];
+            }
+        if (!packed_factor(3, own))
+            continue;
+        for (int p = 0; p < DISNEY_N; p++)
+            packed_solve(3, own, mixed[p]);
+        for (int i = 0; i < n; i++) {
+            const int patch = (int)((int64_t)k * PATCHES / w->n);
+            for (int p = 0; p < DISNEY_N; p++) {
+                J[i][p] = (double)rows[i].J[p];
+                for (int a = 0; a < 3; a++)
+                    J[i][p] -= mixed[p][a] * (double)rows[i].J[DISNEY_N + a];
+                by_view[rows[i].view][p] += J[i][p] * (double)rows[i].residual;
+                by_patch[patch][p] += J[i][p] * (double)rows[i].residual;
+            }
+            for (int p = 0; p < DISNEY_N; p++)
+                for (int q = 0; q <= p; q++)
+                    A[packed_at(p, q)] += J[i][p] * J[i][q];
+        }
+    }
+    for (int p = 0; !err && p < DISNEY_N; p++) {
+        A[packed_at(p, p)] += hold;
+        for (int q = 0; q <= p; q++) {
+            if ((frozen >> p & 1) || (frozen >> q & 1))
+                continue;
+            for (int v = 0; v < n_views; v++)
+                B[packed_at(p, q)] += by_view[v][p] * by_view[v][q];
+            for (int v = 0; v < PATCHES; v++)
+                B[packed_at(p, q)] += by_patch[v][p] * by_patch[v][q];
+        }
+    }
+    free(by_view);
+    free(by_patch);
+    free(J);
+    if (err)
+        return err;
+    for (int p = 0; p < DISNEY_N; p++) {
+        for (int q = 0; q < DISNEY_N && (frozen >> p & 1); q++)
+            A[packed_at(p, q)] = p == q;
+        B[packed_at(p, p)] += frozen >> p & 1 ? 0 : .25 * hold * hold; // `hold` draws from a truth that is some .5 away
+    }
+    double inverse[DISNEY_N][DISNEY_N] = { { 0 } };
+    const bool regular = packed_factor(DISNEY_N, A);
+    for (int p = 0; regular && p < DISNEY_N; p++) {
+        inverse[p][p] = 1;
+        packed_solve(DISNEY_N, A, inverse[p]);
+    }
+    for (int p = 0; p < DISNEY_N; p++)
+        for (int q = 0; q < DISNEY_N; q++)
+            for (int a = 0; a < DISNEY_N; a++)
+                for (int b = 0; b < DISNEY_N; b++)
+                    C[p][q] += inverse[p][a] * B[packed_at(a, b)] * inverse[b][q];
+    for (int p = 0; p < DISNEY_N; p++) {
+        // what the data do not say, or say no better than that it is a number in [0,1], has no standard deviation
+        const double said = regular && !(frozen >> p & 1) ? 1 - hold * inverse[p][p] : 0;
+        r->std[p] = said > .5 && C[p][p] < 1. / 12 ? (float)sqrt(C[p][p]) : INFINITY;
+        for (int q = 0; q <= p; q++)
+            r->covariance[packed_at(p, q)] = C[p][q];
+    }
+    return 0;
+}
+
+// Does the region do without? What views set aside are better off without, or neither miss nor tell from plain by two standard deviations,
+// stays plain. Metal first: a little of it passes for anything.
+static int simplify(struct search *s, const struct witnesses *w, struct region *r, int at, uint16_t *frozen, double *error2,
+                    struct region *full)
+{
+    static const uint16_t without[] = {
+        1 << DISNEY_METALLIC, 1 << DISNEY_CLEARCOAT | 1 << DISNEY_CLEARCOAT_GLOSS, 1 << DISNEY_SUBSURFACE, 1 << DISNEY_SHEEN | 1 << DISNEY_SHEEN_TINT,
+        1 << DISNEY_ANISOTROPIC, 1 << DISNEY_SPECULAR_TINT,
+    };
+    int err = test(s, w, r->theta, 0, -1, error2, NULL, NULL);
+    for (size_t k = 0; !err && k < sizeof(without) / sizeof(*without); k++) {
+        struct region simpler = *r;
+        const int p = __builtin_ctz(without[k]); // the layer's amount; the other says how it looks
+        double error;
+        err = region_uncertainty(s, w, *frozen, r);
+        if (!k)
+            *full = *r;
+        if (!err)
+            err = fit_shared(s, &s->inner, w, *frozen | without[k], false, simpler.theta);
+        if (!err)
+            err = test(s, w, simpler.theta, 0, -1, &error, NULL, NULL);
+        if (err)
+            break;
+        const bool plain_enough = !(r->theta[p] - plain[p] > 2 * unknown_misfit * r->std[p]);
+        log_debug("regions: region %d without %s (%.3f +- %.3f): views aside %.4f -> %.4f %%", at, disney_parameter_names[p], (double)r->theta[p],
+                  (double)r->std[p], 100 * sqrt(*error2), 100 * sqrt(error));
+        if (error < better_without * *error2 || (plain_enough && error < worth_a_layer * *error2 + rounding2)) {
+            *frozen |= without[k];
+            *error2 = error;
+            memcpy(r->theta, simpler.theta, sizeof(r->theta));
+        }
+    }
+    return err;
+}
+
+static int choose_freedom(struct search *s, struct region *r, int at)
+{
+    // By what a texel can tell, best first (SOLVER.md 4); the rest belongs to regions.
+    static const int candidates[] = { DISNEY_ROUGHNESS, DISNEY_METALLIC, DISNEY_SPECULAR, DISNEY_SUBSURFACE };
+    struct witnesses w;
+    struct region full = { 0 };
+    double error2 = 0, std;
+    uint16_t free_mask = 0, frozen = 0;
+    call_witnesses(s, 1u << at, &w);
+    int err = fit_shared(s, &s->inner, &w, 0, false, r->theta);
+    if (!err)
+        err = simplify(s, &w, r, at, &frozen, &error2, &full);
+    for (int p = 0; p < DISNEY_N; p++)
+        r->freedom[p] = frozen >> p & 1 ? PARAMETER_FROZEN : PARAMETER_TIED;
+    for (size_t k = 0; !err && k < sizeof(candidates) / sizeof(*candidates); k++) {
+        double with;
+        const uint16_t tried = (uint16_t)(free_mask | 1 << candidates[k]);
+        if (frozen >> candidates[k] & 1)
+            continue;
+        err = test(s, &w, r->theta, tried, candidates[k], &with, &std, NULL);
+        log_debug("regions: region %d, %s free per texel: views aside %.4f -> %.4f %%, std %.3f", at, disney_parameter_names[candidates[k]],
+                  100 * sqrt(error2), 100 * sqrt(with), std);
+        if (!err && std < most_free_std && with + rounding2 < worth_a_parameter * error2) {
+            free_mask = tried, error2 = with;
+            r->freedom[candidates[k]] = PARAMETER_FREE;
+        }
+    }
+    r->aside_rmse_percent = 100 * sqrt(error2);
+    struct shared_fit last = { .s = s, .scene = s->scene, .w = &w, .frozen = frozen };
+    double cost;
+    if (!err && w.n) // to the end: clearcoat against sheen is a long valley
+        err = fit_from(&last, r->theta, 100, 1e-8, r->theta, &cost);
+    if (!err)
+        err = region_uncertainty(s, &w, frozen, r);
+    // What was frozen might have been otherwise: the doubt is that of the full model, and how far freezing moved the others.
+    for (int p = 0; !err && p < DISNEY_N; p++)
+        if (isfinite(r->std[p]))
+            r->std[p] = unknown_misfit * hypotf(fmaxf(r->std[p], full.std[p]), r->theta[p] - full.theta[p]);
+    for (int p = 0; p < THETA_PACKED; p++)
+        r->covariance[p] = (double)(unknown_misfit * unknown_misfit) * full.covariance[p];
+    return err;
+}
+
+// ---- the whole ----------------------------------------------------------------------------------------------------------
+
+static void search_free(struct search *s)
+{
+    for (int i = 0; s->worker && i < s->n_workers; i++)
+        texel_worker_free(s->worker[i]);
+    free(s->worker);
+    free((void *)s->inner.use_view);
+    free((void *)s->aside.use_view);
+    free(s->texel);
+    free(s->cost);
+}
+
+static int search_new(struct search *s, const struct texel_scene *scene, const struct level *level)
+{
+    const int n_views = scene->samples->n_views;
+    uint8_t *inner = calloc((size_t)n_views + 1, 1), *aside = calloc((size_t)n_views + 1, 1);
+    s->scene = scene, s->level = level;
+    s->inner = s->aside = *scene;
+    s->inner.use_view = inner, s->aside.use_view = aside;
+    s->texel = malloc(((size_t)level->n + 1) * sizeof(*s->texel));
+    s->cost = malloc(((size_t)level->n + 1) * REGIONS_MAX * sizeof(float));
+    s->n_workers = s->n_threads > 0 ? s->n_threads : parallel_n_cores();
+    s->worker = calloc((size_t)s->n_workers, sizeof(*s->worker));
+    if (!inner || !aside || !s->texel || !s->cost || !s->worker)
+        return -ENOMEM;
+    for (int i = 0; i < s->n_workers; i++)
+        if (texel_worker_new(&s->worker[i], scene))
+            return -ENOMEM;
+    for (int v = 0, k = 0; v < n_views; v++)
+        if (!scene->use_view || scene->use_view[v]) {
+            aside[v] = k++ % 3 == 1;
+            inner[v] = !aside[v];
+        }
+    for (int i = 0; i < level->n; i++) {
+        s->texel[i] = !level->first_delegate ? i : level->first_delegate[i] < level->first_delegate[i + 1] ? level->delegate[level->first_delegate[i]] : -1;
+        if (s->texel[i] >= 0 && scene->samples->first[s->texel[i]] == scene->samples->first[s->texel[i] + 1])
+            s->texel[i] = -1;
+    }
+    return 0;
+}
+
+int regions_find(struct regions *out, uint8_t *region_of, const struct texel_scene *scene, const struct level *level,
+                 const float (*theta)[DISNEY_N], float (*albedo)[3], int n_threads)
+{
+    struct search s = { .albedo = albedo, .n_threads = n_threads, .region = region_of, .out = out };
+    memset(out, 0, sizeof(*out));
+    int err = search_new(&s, scene, level);
+    if (!err)
+        err = cut(&s, theta);
+    if (!err)
+        err = fit_all(&s, true);
+    for (int round = 0; !err && round < DEAL_ROUNDS; round++) {
+        err = deal_out(&s);
+        if (!err)
+            err = dissolve_small(&s);
+        if (!err)
+            err = fit_all(&s, true);
+    }
+    if (!err)
+        err = merge(&s);
+    for (int r = 0; !err && r < out->n; r++)
+        err = choose_freedom(&s, &out->region[r], r);
+    if (!err)
+        count(&s);
+    search_free(&s);
+    return err;
+}
+
+// ---- finer levels -------------------------------------------------------------------------------------------------------
+
+struct refinement {
+    const struct regions *r;
+    const struct texel_scene *scene;
+    const struct level *level;
+    const float (*albedo)[3];
+    uint8_t *region;
+    uint8_t *candidates; // [level n] a bit per region; 0: no doubt
+    float *cost;         // [level n][REGIONS_MAX]
+    struct texel_worker **worker;
+};
+
+static void cost_doubtful(void *arg, int64_t begin, int64_t end, int worker)
+{
+    const struct refinement *f = arg;
+    const struct level *l = f->level;
+    for (int i = (int)begin; i < (int)end; i++) {
+        float *cost = f->cost + (size_t)i * REGIONS_MAX;
+        for (int r = 0; r < f->r->n; r++)
+            cost[r] = f->candidates[i] ? (f->candidates[i] >> r & 1 ? 0 : INFINITY) : (f->region[i] == r ? 0 : INFINITY);
+        const int32_t first = l->first_delegate ? l->first_delegate[i] : 0, n = l->first_delegate ? l->first_delegate[i + 1] - first : 1;
+        for (int r = 0; f->candidates[i] && r < f->r->n; r++) {
+            struct texel_sums sums = { 0 };
+            for (int32_t d = 0; d < n && (f->candidates[i] >> r & 1); d++) {
+                const int32_t t = l->first_delegate ? l->delegate[first + d] : i;
+                float albedo[3];
+                memcpy(albedo, f->albedo[t], sizeof(albedo));
+                texel_fit(f->scene, f->worker[worker], t, 0, f->r->region[r].theta, albedo, 1, &sums);
+            }
+            if (f->candidates[i] >> r & 1)
+                cost[r] = (float)(sums.cost / fmax(sums.n, 1));
+        }
+    }
+}
+
+int regions_refine(const struct regions *r, uint8_t *region_of, const uint8_t *parent_region_of, const struct texel_scene *scene,
+                   const struct level *level, const float (*albedo)[3], int n_threads)
+{
+    const size_t n = (size_t)level->n + 1;
+    const int n_workers = n_threads > 0 ? n_threads : parallel_n_cores();
+    struct refinement f = { .r = r, .scene = scene, .level = level, .albedo = albedo, .region = region_of,
+                            .candidates = calloc(n, 1), .cost = malloc(n * REGIONS_MAX * sizeof(float)),
+                            .worker = calloc((size_t)n_workers, sizeof(*f.worker)) };
+    int err = f.candidates && f.cost && f.worker ? 0 : -ENOMEM;
+    for (int i = 0; !err && i < n_workers; i++)
+        err = texel_worker_new(&f.worker[i], scene);
+    for (int i = 0; i < level->n; i++)
+        region_of[i] = parent_region_of[level->parent[i]];
+    // two texels wide: a border may lie a parent's width off
+    for (int i = 0; !err && i < level->n; i++) {
+        unsigned around = 1u << region_of[i];
+        for (int32_t m = level->first_neighbour[i]; m < level->first_neighbour[i + 1]; m++) {
+            const int j = level->neighbour[m];
+            around |= 1u << region_of[j];
+            for (int32_t o = level->first_neighbour[j]; o < level->first_neighbour[j + 1]; o++)
+                around |= 1u << region_of[level->neighbour[o]];
+        }
+        f.candidates[i] = (uint8_t)(around & (around - 1) ? around : 0);
+    }
+    if (!err) {
+        float unit = 0; // from the texels in doubt: the mean of their least costs
+        int n_doubtful = 0;
+        parallel_for(n_threads, level->n, 64, cost_doubtful, &f);
+        for (int i = 0; i < level->n; i++) {
+            float least = INFINITY;
+            for (int k = 0; f.candidates[i] && k < r->n; k++)
+                least = fminf(least, f.cost[(size_t)i * REGIONS_MAX + (size_t)k]);
+            if (f.candidates[i])
+                unit += least, n_doubtful++;
+        }
+        deal(level, f.cost, r->n, n_doubtful ? .25f * unit / (float)n_doubtful : 0, region_of);
+    }
+    for (int i = 0; f.worker && i < n_workers; i++)
+        texel_worker_free(f.worker[i]);
+    free(f.worker);
+    free(f.candidates);
+    free(f.cost);
+    return err;
+}

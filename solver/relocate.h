@@ -1,0 +1,12 @@
+// solver/relocate.h - stage 1 once more, with materials that stage 2 found in place of one shared reflectance.
+//
+// An object of metal and clay under one theta pulls the lights to where they explain the difference. With every texel's own theta held (and its
+// albedo eliminated, as ever) the lights are free to go where they are; then the materials are found again.
+#pragma once
+#include "solver/joint.h"
+
+// state: lights and albedo, in and out; its log_gain stays. theta[n_texels]. The similarity term starts 100 times as heavy as first_w_sim and falls by
+// decades as long as views set aside gain. error_before, error_after: RMSE of those views in percent. 0 or -ENOMEM.
+int relocate_lights(struct photometric_state *state, const struct texels *texels, const struct samples *samples, const struct rays *rays,
+                    int n_groups, const uint8_t *hold_out, const float (*theta)[DISNEY_N], const struct joint_settings *settings,
+                    double *error_before, double *error_after);
