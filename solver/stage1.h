@@ -1,5 +1,5 @@
 // solver/stage1.h - stage 1 as a least-squares problem: E_photo + w_sim E_sim (Eqs. 6, 11, 12) over theta, c, R and the
-// distances, minimised by lm.h. Shared by the methods of joint.h; nobody else includes it. The methods differ in what they
+// distances, minimised by lm.h. Shared by the methods of joint.h and by relocate.h. They differ in what they
 // make free, in the samples they weigh (p.weight, p.use_view, p.texel_step may be changed between two calls) and in the order of calls.
 #pragma once
 #include "solver/emitters.h"

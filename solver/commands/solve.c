@@ -1,7 +1,9 @@
 // solver/commands/solve.c - rigsolve solve: from a take to the lights' places and a shared reflectance with per-texel albedo.
 #include "solver/commands/arguments.h"
 #include "solver/commands/commands.h"
+#include "solver/commands/export.h"
 #include "solver/commands/inputs.h"
+#include "solver/commands/report.h"
 #include "solver/commands/solve_materials.h"
 #include "solver/joint.h"
 #include "solver/parallel.h"
@@ -40,7 +42,7 @@ enum {
 
 static const struct argp_option options[] = {
     { 0, 0, 0, 0, "Method", 2 },
-    { "preset", OPTION_PRESET, "NAME", 0, "preview (texture 128), standard (512, default) or final (2048)", 2 },
+    { "preset", OPTION_PRESET, "NAME", 0, "preview (texture 128), standard (256, default) or final (512); with --stage 2: 128, 512, 2048", 2 },
     { "method", OPTION_METHOD, "NAME", 0, "joint (default), alternating (the paper) or directional", 2 },
     { "texture", OPTION_TEXTURE, "N", 0, "N x N texels", 2 },
     { "lights", OPTION_LIGHTS, "N", 0, "lights with a distance of their own, a power of two (256)", 2 },
@@ -278,6 +280,24 @@ static struct json *numbers_by_name(const double *values)
     return o;
 }
 
+// Absolute, so that a solve's folder may be read from anywhere; nothing where path is NULL.
+static void set_path(struct json *inputs, const char *key, const char *path)
+{
+    char *real = path ? realpath(path, NULL) : NULL;
+    if (path)
+        json_set_string(inputs, key, real ? real : path);
+    free(real);
+}
+
+// What other programs and people read: model.glb, model.mtlx, report.html.
+static int write_for_others(const struct settings *s)
+{
+    struct export_summary exported;
+    const struct report_inputs page = { .solve_dir = s->out, .n_views = 4, .n_threads = s->n_threads };
+    const int err = export_folder(&exported, s->out, NULL, s->out, EXPORT_GLB | EXPORT_MTLX, s->n_threads);
+    return err ? err : report_folder(&page);
+}
+
 static struct json *make_report(const struct scene *scene, const struct settings *s, const struct joint_result *r, const struct materials *m,
                                 double wall, double stage_s, double materials_s)
 {
@@ -330,10 +350,16 @@ static struct json *make_report(const struct scene *scene, const struct settings
     if (m->theta)
         solve_report_materials(o, stages, m, materials_s);
     json_set(o, "stages", stages);
-    char *mesh = realpath(s->in.mesh_path, NULL);
-    json_set_string(inputs, "mesh", mesh ? mesh : s->in.mesh_path);
-    free(mesh);
+    set_path(inputs, "take", s->in.take_dir);
+    set_path(inputs, "mesh", s->in.mesh_path);
+    set_path(inputs, "cameras", s->in.cameras_path);
+    set_path(inputs, "images", s->in.images_dir);
     json_set(o, "inputs", inputs);
+    struct json *held_out = json_array();
+    for (int v = 0; v < s->in.cameras.n; v++)
+        if (scene->held_out[v])
+            json_append_string(held_out, s->in.cameras.view[v].name);
+    json_set(o, "views_held_out", held_out);
     return o;
 }
 
@@ -418,7 +444,8 @@ int command_solve(int argc, char **argv)
     if (!s.n_sub)
         s.n_sub = s.joint.method == METHOD_JOINT ? 4 : 1;
     if (!s.texture)
-        s.texture = !strcmp(s.preset, "preview") ? 128 : !strcmp(s.preset, "final") ? 2048 : 512;
+        s.texture = !strcmp(s.preset, "preview") ? 128
+                    : !strcmp(s.preset, "final") ? (s.materials.last_stage == 2 ? 2048 : 512) : s.materials.last_stage == 2 ? 512 : 256;
     int err = load(&scene, &s);
     const double stage_begin = wall_s();
     if (!err && s.materials.lights_from)
@@ -433,6 +460,8 @@ int command_solve(int argc, char **argv)
         const double now = wall_s();
         struct json *report = make_report(&scene, &s, &result, &materials, now - begin, materials_begin - stage_begin, now - materials_begin);
         err = write_result(&scene, &s, &result, &materials, report);
+        if (!err)
+            err = write_for_others(&s);
         if (!err && s.json) {
             char *text = json_text(report);
             puts(text ? text : "");
