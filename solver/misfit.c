@@ -156,58 +156,71 @@ static int by_double(const void *a, const void *b)
     return (x > y) - (x < y);
 }
 
-// A of all, and g of every patch that has any; *n of them.
-static int pull_of_patches(double *A, double *g, int *n, const struct photometric *p, const struct photometric_state *s,
-                           const unsigned char *is_free, size_t n_unknowns)
+// A of all, and g of every patch (0 where nothing is in it).
+static int pull_of_patches(double *A, double *g, const struct photometric *p, const struct photometric_state *s, const unsigned char *is_free,
+                           size_t n_unknowns)
 {
     const struct texels *t = p->texels;
     struct photometric patch = *p;
     uint8_t *use = malloc((size_t)t->n + 1);
     int err = use ? 0 : -ENOMEM;
     patch.use_texel = use;
-    *n = 0;
     for (int k = 0; !err && k < N_PATCHES; k++) {
-        double *pull = g + (size_t)*n * n_unknowns, most = 0;
         for (int i = 0; i < t->n; i++) {
             const int x = (int)t->pixel[i] % t->size * PATCHES / t->size, y = (int)t->pixel[i] / t->size * PATCHES / t->size;
             use[i] = y * PATCHES + x == k && (!p->use_texel || p->use_texel[i]);
         }
-        err = photometric_normal_equations(&patch, s, is_free, A, pull);
-        for (size_t i = 0; i < n_unknowns; i++)
-            most = fmax(most, fabs(pull[i]));
-        *n += most > 0;
+        err = photometric_normal_equations(&patch, s, is_free, A, g + (size_t)k * n_unknowns);
     }
     free(use);
     return err;
 }
 
-// Median over the distances of (variance by patches) / (variance of independent samples); C = A^-1.
-// How much larger each unknown's variance is than sigma2 C says, when a patch is one draw ([n], at least 1). Returns the median over the
-// distances: one of them alone is told by few patches.
-static double inflations(double *inflation, const double *C, const double *g, int n_patches, double sigma2, const unsigned char *used,
-                         const struct photometric_layout *l)
+// Squares of `wide` x `wide` patches become one draw each: their pulls into out, those without any left out. Returns how many.
+static int widen(double *out, const double *g, int wide, size_t n)
+{
+    const int side = PATCHES / wide;
+    int n_draws = 0;
+    for (int k = 0; k < side * side; k++) {
+        double *draw = out + (size_t)n_draws * n, most = 0;
+        memset(draw, 0, n * sizeof(double));
+        for (int i = 0; i < wide * wide; i++) {
+            const int patch = (k / side * wide + i / wide) * PATCHES + k % side * wide + i % wide;
+            for (size_t j = 0; j < n; j++)
+                draw[j] += g[(size_t)patch * n + j];
+        }
+        for (size_t j = 0; j < n; j++)
+            most = fmax(most, fabs(draw[j]));
+        n_draws += most > 0;
+    }
+    return n_draws;
+}
+
+// How much larger each unknown's variance is than sigma2 C says when a patch is one draw ([n]): raised to that where it is less.
+// Returns the median over the distances: one of them alone is told by few patches.
+static double inflate(double *inflation, const double *C, const double *draws, int n_draws, double sigma2, const unsigned char *used,
+                      const struct photometric_layout *l)
 {
     const size_t n = (size_t)l->n;
     double of_distances[l->n_groups], mean[n];
     int m = 0;
     for (size_t j = 0; j < n; j++) {
         mean[j] = 0;
-        for (int k = 0; k < n_patches; k++)
-            mean[j] += g[(size_t)k * n + j] / n_patches;
+        for (int k = 0; k < n_draws; k++)
+            mean[j] += draws[(size_t)k * n + j] / n_draws;
     }
     for (size_t i = 0; i < n; i++) {
         double sum = 0;
-        inflation[i] = 1;
-        for (int k = 0; used[i] && k < n_patches; k++) {
+        for (int k = 0; used[i] && k < n_draws; k++) {
             double step = 0;
             for (size_t j = 0; j < n; j++)
-                step += C[i * n + j] * (g[(size_t)k * n + j] - mean[j]);
+                step += C[i * n + j] * (draws[(size_t)k * n + j] - mean[j]);
             sum += step * step;
         }
-        if (used[i])
-            inflation[i] = fmax(sum * n_patches / (n_patches - 1) / (sigma2 * C[i * n + i]), 1);
+        const double here = used[i] ? sum * n_draws / (n_draws - 1) / (sigma2 * C[i * n + i]) : 1;
+        inflation[i] = fmax(inflation[i], here);
         if (used[i] && i >= (size_t)l->inverse_distance)
-            of_distances[m++] = inflation[i];
+            of_distances[m++] = here;
     }
     qsort(of_distances, (size_t)m, sizeof(double), by_double);
     return m ? of_distances[m / 2] : 1;
@@ -218,12 +231,13 @@ int misfit_deviations(double *deviation, double *inflation, const struct photome
 {
     const struct photometric_layout l = photometric_layout_of(p->samples->n_views, p->n_groups);
     const size_t n = (size_t)l.n;
-    double *A = calloc(n * n, sizeof(double)), *C = calloc(n * n, sizeof(double)), *g = calloc(N_PATCHES * n, sizeof(double));
+    double *A = calloc(n * n, sizeof(double)), *C = calloc(n * n, sizeof(double)), *g = calloc(N_PATCHES * n, sizeof(double)),
+           *draws = calloc(N_PATCHES * n, sizeof(double));
     unsigned char used[n];
     double own[n];
     struct photometric_error e = { 0 };
-    int n_patches = 0, singular = 0;
-    int err = A && C && g ? pull_of_patches(A, g, &n_patches, p, s, is_free, n) : -ENOMEM;
+    int singular = 0;
+    int err = A && C && g && draws ? pull_of_patches(A, g, p, s, is_free, n) : -ENOMEM;
     if (!err)
         err = photometric_evaluate(p, (struct photometric_state *)s, false, &e);
     if (err)
@@ -237,8 +251,11 @@ int misfit_deviations(double *deviation, double *inflation, const struct photome
     for (size_t i = 0; i < n; i++)
         own[i] = 1;
     singular = lm_inverse(l.n, A, used, C);
-    if (!singular && n_patches > 1 && sigma2 > 0)
-        *inflation = inflations(own, C, g, n_patches, sigma2, used, &l);
+    for (int wide = 1; !singular && sigma2 > 0 && wide <= 2; wide++) { // nobody knows how far structure reaches: the worse of two
+        const int n_draws = widen(draws, g, wide, n);
+        if (n_draws > 1)
+            *inflation = fmax(*inflation, inflate(own, C, draws, n_draws, sigma2, used, &l));
+    }
     if (singular != -ENOMEM && prior && sigma2 > 0) {
         for (size_t i = 0; i < n * n; i++)
             A[i] += *inflation * sigma2 * prior[i];
@@ -249,6 +266,6 @@ int misfit_deviations(double *deviation, double *inflation, const struct photome
         deviation[i] = !used[i] ? INFINITY : singular ? NAN
                        : sqrt((i < (size_t)l.inverse_distance ? fmax(own[i], *inflation) : *inflation) * sigma2 * C[i * (n + 1)]);
 end:
-    free(A), free(C), free(g);
+    free(A), free(C), free(g), free(draws);
     return err;
 }

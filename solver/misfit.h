@@ -35,7 +35,7 @@ static inline bool misfit_is_poor(const struct misfit *m)
 
 // Standard deviations of the unknowns (photometric_layout; [n]) that know of structure. sigma^2 A^-1 takes every sample for an
 // independent draw. Here the texture is cut into patches, and each patch's pull on the unknowns is one draw: what neighbours share
-// does not average out inside it. How much larger the distances' variances come out so (the median, at least 1) is *inflation, which is
+// does not average out inside it. Patches of a sixth of the side and of a third: the larger variance counts. How much larger the distances' variances come out so (the median, at least 1) is *inflation, which is
 // theirs; the other unknowns have their own, or this where theirs is less;
 // C = (A / (inflation sigma^2) + prior)^-1. prior [n][n], or NULL: what is known beside the pictures, as a precision (E_sim: 1
 // beside 1 / |dh_i - dh_j|^2 is a wall seen at 45 degrees; not the weight of a regularisation, that is chosen for the estimate).
