@@ -223,6 +223,7 @@ perl -MJSON::PP -0777 -ne '$d = decode_json($_); $d->{views_held_out} = ["cam006
 gives 0 "report of a solve that set a view aside" "$rigsolve" report "$dir/solve3" --take "$dir/diffuse"
 grep -q '<h3>cam006 <small>(set aside' "$dir/solve3/report.html"
 result $? "shows that view, and says so"
+perl -MJSON::PP -i -0777 -pe '$d = decode_json($_); delete $d->{inputs}{take}; delete $d->{inputs}{images}; $_ = encode_json($d)' "$dir/solve0/report.json"
 gives 0 "report without a take" "$rigsolve" report "$dir/solve0" -o "$dir/bare.html"
 grep -q 'not to be trusted' "$dir/bare.html" && ! grep -q 'the photograph' "$dir/bare.html"
 result $? "shows none, and says when not to believe a result"

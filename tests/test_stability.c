@@ -60,8 +60,8 @@ static void distances_of(double *distance_m, const struct studio *s, const struc
     struct joint_result r;
     assert_int_equal(input_make(&in, s, p, 0), 0);
     assert_int_equal(joint_solve(&r, &in.texels, &in.samples, in.rays, &in.lights, s->size.n_lights, in.held_out, &set), 0);
-    for (int g = 0; g < s->size.n_lights; g++)
-        distance_m[g] = 1 / r.state.lights.inverse_distance[g * s->size.n_sub];
+    for (int i = in.lights.n - 1; i >= 0; i--) // of each group, its first
+        distance_m[in.lights.group[i]] = 1 / r.state.lights.inverse_distance[i];
     joint_result_free(&r);
     input_free(&in);
 }
