@@ -68,7 +68,7 @@ static struct settings {
     struct synth_settings synth;
 } settings = {.sets = "D2,D3", .methods = "joint,alternating", .takes = "build/stability/takes", 
               .n_seeds = 2, .n_random = 100,
-              .size = {.n_views = 40, .texture = 96, .thin = 3, .n_lights = 64, .n_sub = 16}};
+              .size = {.n_views = 40, .texture = 96, .thin = 3, .n_lights = 256, .n_sub = 4}};
 
 static bool listed(const char *list, const char *name)
 {
@@ -306,8 +306,8 @@ static const struct argp_option options[] = {
     {"views", 'v', "N", 0, "fitted and held out (40)", 0},
     {"texture", 't', "N", 0, "texels a side (96)", 0},
     {"thin", 'i', "K", 0, "of K x K texels one is looked at (3)", 0},
-    {"lights", 'l', "N", 0, "a power of two (64)", 0},
-    {"sub-lights", 'u', "K", 0, "each light is K for joint, 1 for alternating (16)", 0},
+    {"lights", 'l', "N", 0, "a power of two (256)", 0},
+    {"sub-lights", 'u', "K", 0, "each light is K for joint, 1 for alternating (4)", 0},
     {"true-lights", 'T', "N", 0, "of the synthetic studio (4096)", 0},
     {"size", 'z', "WxH", 0, "of its pictures (240x160)", 0},
     {"seed", 'S', "N", 0, "of the synthetic studio (1)", 0},
