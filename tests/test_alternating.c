@@ -147,10 +147,10 @@ static void a_panorama_far_turned_is_turned_back_in_a_few_steps(void **state)
         w[axis] = .8;
         mat3_from_rotation_vector(turn, w);
         mat3_mul(stage.base.lights.world_from_probe, turn, truth.world_from_probe);
-        assert_int_equal(stage1_minimise(&stage, 60, 1e-8, NULL), 0);
+        assert_int_equal(stage1_minimise(&stage, 60, 1e-6, NULL), 0);
         below("rotation, degrees", judge_angle_between(stage.base.lights.world_from_probe, truth.world_from_probe) * 180 / M_PI,
               4); // 2.1: 128 lights for 4096
-        below("Jacobians", stage.n_jacobians, 10); // 7; as many again without the turn of the columns
+        below("Jacobians", stage.n_jacobians, 8);
         stage1_free(&stage);
     }
 }
