@@ -163,7 +163,7 @@ static void seams_are_closed_with_the_nearest_texels_of_other_charts(void **stat
     }
     assert_true(n_boundary > 100);
     assert_true(n_closed > .95 * n_boundary);
-    levels_free(&l);
+    levels_free(&l), texels_free(&t);
 
     struct levels_settings open = usual;
     open.seams = false;
