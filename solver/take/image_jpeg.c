@@ -70,11 +70,13 @@ int image_read_jpeg(struct image *out, const struct image_file *file)
             for (size_t i = 0; i < n; i++)
                 to[i] = (float)row[i] / 255;
         }
-        if (jpeg.err->num_warnings) // a cut file is filled up with grey
-            log_warning("image: %s: the JPEG is damaged (%ld warnings)", file->name, jpeg.err->num_warnings);
-    } else {
-        image_free(image);
+        if (jpeg.err->num_warnings) { // what is cut off, libjpeg fills up with grey
+            log_error("image: %s: the JPEG is damaged or cut off; write it again", file->name);
+            err = -EINVAL;
+        }
     }
+    if (err)
+        image_free(image);
     jpeg_destroy_decompress(&jpeg);
     free(row);
     return err;
