@@ -1241,7 +1241,8 @@ static void textures_come_from_eight_bits(void **state)
     for (size_t cut = 2; cut < n; cut += n / 7) { // cut off
         struct image_file file = { bytes, cut, "cut.jpg" };
         listen();
-        assert_int_equal(image_read_jpeg(&image, &file), -EINVAL);
+        if (image_read_jpeg(&image, &file) != -EINVAL)
+            fail_msg("the first %zu of %zu bytes were read", cut, n);
         assert_logged("cut.jpg");
     }
     free(bytes);

@@ -70,6 +70,7 @@ int image_read_jpeg(struct image *out, const struct image_file *file)
             for (size_t i = 0; i < n; i++)
                 to[i] = (float)row[i] / 255;
         }
+        jpeg_finish_decompress(&jpeg);
         if (jpeg.err->num_warnings) { // what is cut off, libjpeg fills up with grey
             log_error("image: %s: the JPEG is damaged or cut off; write it again", file->name);
             err = -EINVAL;
