@@ -50,10 +50,10 @@ FUZZERS := cameras cameras_import csv exr hdr json lights mesh
 
 # ---- rules --------------------------------------------------------------------------------------------------------------
 object = $(patsubst %.c,$(BUILD)/obj/%.o,$(1))
-ifneq ($(filter test demo bench chart figure5 stability experiments,$(MAKECMDGOALS)),)
+ifneq ($(filter test demo bench chart figure5 figures stability experiments,$(MAKECMDGOALS)),)
 FIRST := deps # these install what is missing before the first file is compiled
 endif
-.PHONY: all deps deps-fuzz deps-bench test demo bench chart figure5 stability experiments fuzz check-includes man install clean help
+.PHONY: all deps deps-fuzz deps-bench test demo bench chart figure5 figures stability experiments fuzz check-includes man install clean help
 .DELETE_ON_ERROR:
 .SECONDARY:
 
@@ -136,6 +136,9 @@ chart: deps deps-bench $(BUILD)/tests/bench/chart_lights
 figure5: deps deps-bench $(BUILD)/tests/bench/figure5
 	@mkdir -p build/figure5 && $(BUILD)/tests/bench/figure5 build/figure5 >build/figure5/figure5.csv && gnuplot -e "out='build/figure5/figure5'" tests/bench/figure5.gp
 	@echo "figure5: build/figure5/figure5.csv .svg .png: the paper's Figure 5: w_sim x start x true lights"
+figures: deps deps-bench $(BUILD)/bin/rigsolve
+	@BIN=$(BUILD)/bin sh tests/bench/figures_materials.sh
+	@echo "figures: build/figures_materials/*.csv, *.svg: the paper's Figures 8 to 11"
 STABILITY_OPTIONS ?=
 stability: deps deps-bench $(BUILD)/tests/bench/stability_kernels $(BUILD)/tests/bench/stability_joint
 	@mkdir -p build/stability && $(BUILD)/tests/bench/stability_kernels >build/stability/kernels.csv && gnuplot -e "out='build/stability/kernels'" tests/bench/stability_kernels.gp
