@@ -11,7 +11,8 @@ BUILD := build$(if $(filter-out release,$(VARIANT)),/$(VARIANT))
 MACHINE := $(shell uname -m)
 
 # ---- packages (Debian 12; the same names in Debian 13) ----------------------------------------------------------------
-PACKAGES := gcc make pkg-config libopenexr-dev libembree-dev libassimp-dev libjansson-dev libtiff-dev libpng-dev libexpat1-dev liblapacke-dev libopenblas-dev libcmocka-dev perl help2man
+PACKAGES := gcc make pkg-config libopenexr-dev libembree-dev libassimp-dev libjansson-dev libtiff-dev libpng-dev libexpat1-dev liblapacke-dev libopenblas-dev libcmocka-dev perl help2man \
+  libgphoto2-dev libgpiod-dev libinih-dev libsystemd-dev libxxhash-dev
 PACKAGES_FUZZ := clang libclang-rt-dev
 PACKAGES_BENCH := libceres-dev g++ gnuplot-nox
 
@@ -40,12 +41,17 @@ SOLVER := $(addprefix solver/,alternating.c cameras.c cameras_bundler.c cameras_
 KERNELS := $(addprefix solver/kernels/,kernels.c kernels_ref.c kernels_portable.c kernels_avx2.c kernels_avx512.c)
 COMMANDS := $(addprefix solver/commands/,arguments.c brdf.c compare.c export.c inputs.c lights.c output.c render.c report.c solve.c solve_materials.c solved.c synth.c visibility.c)
 LIBRARY := $(TAKE) $(SOLVER) $(KERNELS)
+RIG := $(addprefix rigd/,camera.c digest.c)
+RIG_PROGRAMS := # of rigd rigctl rigd-camera: those whose sources are here
+LIBS_RIG = -ljansson -linih -lsystemd -lxxhash -lgpiod -lm
+LIBS_CAMERA = -lgphoto2 -lgphoto2_port -ljansson -lxxhash -lm
 FUZZED := $(TAKE) $(addprefix solver/,cameras.c cameras_bundler.c cameras_colmap.c cameras_format.c cameras_meshroom.c \
   cameras_metashape.c cameras_realitycapture.c csv.c lights.c mesh.c mesh_gltf_floats.c mesh_import.c orientation.c panorama.c parallel.c \
   picture_size.c texels.c xml.c)
 TESTS := $(addprefix test_,alternating brdf cameras cameras_import compare csv disney emitters export gltf_brdf image joint json judge levels \
   lights lm materials mesh misfit normal_equations orientation panorama parallel pcg photometric rays render report samples shapes stability \
   synth take texels vec3 visibility) check_kernels
+RIG_TESTS := $(addprefix test_,camera digest)
 FUZZERS := cameras cameras_import csv exr hdr json lights mesh
 
 # ---- rules --------------------------------------------------------------------------------------------------------------
@@ -57,7 +63,7 @@ endif
 .DELETE_ON_ERROR:
 .SECONDARY:
 
-all: $(BUILD)/bin/rigsolve
+all: $(BUILD)/bin/rigsolve $(addprefix $(BUILD)/bin/,$(RIG_PROGRAMS))
 
 $(BUILD)/obj/%.o: %.c Makefile | $(FIRST)
 	@mkdir -p $(@D)
@@ -74,14 +80,27 @@ $(BUILD)/libstudiorig.a: $(call object,$(LIBRARY))
 	@rm -f $@
 	@$(if $(V),,echo '  AR $@')
 	$(Q)ar rcsD $@ $^
+$(BUILD)/librig.a: $(call object,$(RIG))
+	@rm -f $@
+	@$(if $(V),,echo '  AR $@')
+	$(Q)ar rcsD $@ $^
 $(BUILD)/bin/rigsolve: $(call object,$(COMMANDS) solver/main.c) $(BUILD)/libstudiorig.a
 	@mkdir -p $(@D)
 	@$(if $(V),,echo '  LD $@')
 	$(Q)$(CC) $(CFLAGS_ALL) $^ $(LIBS) -o $@
+link_rig = @mkdir -p $(@D); $(if $(V),,echo '  LD $@';) $(CC) $(CFLAGS_ALL) $^
+$(BUILD)/bin/rigd: $(call object,rigd/main.c rigd/daemon.c) $(BUILD)/librig.a $(BUILD)/libstudiorig.a
+	$(link_rig) $(LIBS_RIG) -o $@
+$(BUILD)/bin/rigctl: $(call object,rigd/rigctl.c) $(BUILD)/librig.a $(BUILD)/libstudiorig.a
+	$(link_rig) $(LIBS_RIG) -o $@
+$(BUILD)/bin/rigd-camera: $(call object,rigd/camera_worker.c rigd/camera_gphoto.c rigd/ingest.c) $(BUILD)/librig.a $(BUILD)/libstudiorig.a
+	$(link_rig) $(LIBS_CAMERA) -o $@
 $(BUILD)/tests/%: $(BUILD)/obj/tests/%.o $(BUILD)/libstudiorig.a
 	@mkdir -p $(@D)
 	@$(if $(V),,echo '  LD $@')
 	$(Q)$(CC) $(CFLAGS_ALL) $^ -lcmocka $(LIBS) -o $@
+$(addprefix $(BUILD)/tests/,$(RIG_TESTS)): $(BUILD)/tests/%: $(BUILD)/obj/tests/%.o $(BUILD)/librig.a $(BUILD)/libstudiorig.a
+	$(link_rig) -lcmocka $(LIBS_RIG) -o $@
 $(BUILD)/tests/bench/stability_joint: $(call object,solver/commands/arguments.c)
 $(BUILD)/tests/test_pcg: LIBS += $(if $(wildcard /usr/include/suitesparse/cholmod.h),-lcholmod)
 $(BUILD)/fuzz/obj/%.o: %.c Makefile | deps-fuzz
@@ -104,8 +123,8 @@ deps-fuzz: ; $(call install_packages,$(PACKAGES_FUZZ))
 deps-bench: deps ; $(call install_packages,$(PACKAGES_BENCH))
 
 # ---- tests ----------------------------------------------------------------------------------------------------------------
-TEST_PROGRAMS := $(addprefix $(BUILD)/tests/,$(TESTS))
-test: deps $(BUILD)/bin/rigsolve $(TEST_PROGRAMS)
+TEST_PROGRAMS := $(addprefix $(BUILD)/tests/,$(TESTS) $(RIG_TESTS))
+test: deps all $(TEST_PROGRAMS)
 	@CMOCKA_MESSAGE_OUTPUT=TAP BIN=$(BUILD)/bin prove --timer --merge --exec '' tests/check_includes.sh $(TEST_PROGRAMS) tests/test_commands.sh
 check-includes:
 	@prove --exec '' tests/check_includes.sh
