@@ -36,8 +36,8 @@ struct ledger_camera {
     bool expected;              // it takes part; false: left out (quarantined before the shot), see note
     enum debt debt;
     char note[200];             // why it was left out, missed or quarantined, and what to do
-    struct camera_object before; // newest object on the card before the shot: everything later is the take's
-    bool has_before;
+    int n_before;               // newest object of each store before the shot: everything later is the take's
+    struct camera_object before[CAMERA_STORES_MAX];
     int64_t delay_us;           // lag compensation applied
     int64_t lag_ns;             // flash-sync after the press; INT64_MIN: not measured
     int n_settings;
@@ -64,6 +64,7 @@ struct ledger {
 
 void ledger_init(struct ledger *l, const struct config *config); // zeroed but for names; -ENOMEM shows as camera == NULL
 void ledger_free(struct ledger *l);
+bool ledger_is_later(const struct ledger_camera *c, const struct camera_object *o); // than before[] of its store?
 struct ledger_object *ledger_find(struct ledger_camera *c, const struct camera_object *o); // same folder and name; NULL
 // A new object of a camera with the name of its copy: raw/<camera>.<ext>, the second of one extension raw/<camera>_2.<ext>.
 // NULL when there are LEDGER_OBJECTS_MAX already.
