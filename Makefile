@@ -41,7 +41,7 @@ SOLVER := $(addprefix solver/,alternating.c cameras.c cameras_bundler.c cameras_
 KERNELS := $(addprefix solver/kernels/,kernels.c kernels_ref.c kernels_portable.c kernels_avx2.c kernels_avx512.c)
 COMMANDS := $(addprefix solver/commands/,arguments.c brdf.c compare.c export.c inputs.c lights.c output.c render.c report.c solve.c solve_materials.c solved.c synth.c visibility.c)
 LIBRARY := $(TAKE) $(SOLVER) $(KERNELS)
-RIG := $(addprefix rigd/,camera.c digest.c edges.c trigger.c trigger_gpio.c trigger_lines.c trigger_sim.c trigger_software.c)
+RIG := $(addprefix rigd/,calibrate.c camera.c digest.c edges.c ledger.c rig.c trigger.c trigger_gpio.c trigger_lines.c trigger_sim.c trigger_software.c)
 RIG_PROGRAMS := # of rigd rigctl rigd-camera: those whose sources are here
 LIBS_RIG = -ljansson -linih -lsystemd -lxxhash -lgpiod -lm
 LIBS_CAMERA = -lgphoto2 -lgphoto2_port -ljansson -lxxhash -lm
@@ -51,7 +51,7 @@ FUZZED := $(TAKE) $(addprefix solver/,cameras.c cameras_bundler.c cameras_colmap
 TESTS := $(addprefix test_,alternating brdf cameras cameras_import compare csv disney emitters export gltf_brdf image joint json judge levels \
   lights lm materials mesh misfit normal_equations orientation panorama parallel pcg photometric rays render report samples shapes stability \
   synth take texels vec3 visibility) check_kernels
-RIG_TESTS := $(addprefix test_,camera digest trigger)
+RIG_TESTS := $(addprefix test_,camera digest rig trigger)
 FUZZERS := cameras cameras_import csv exr hdr json lights mesh
 
 # ---- rules --------------------------------------------------------------------------------------------------------------
@@ -80,6 +80,10 @@ $(BUILD)/libstudiorig.a: $(call object,$(LIBRARY))
 	@rm -f $@
 	@$(if $(V),,echo '  AR $@')
 	$(Q)ar rcsD $@ $^
+$(BUILD)/libtake.a: $(call object,$(TAKE))
+	@rm -f $@
+	@$(if $(V),,echo '  AR $@')
+	$(Q)ar rcsD $@ $^
 $(BUILD)/librig.a: $(call object,$(RIG))
 	@rm -f $@
 	@$(if $(V),,echo '  AR $@')
@@ -89,17 +93,17 @@ $(BUILD)/bin/rigsolve: $(call object,$(COMMANDS) solver/main.c) $(BUILD)/libstud
 	@$(if $(V),,echo '  LD $@')
 	$(Q)$(CC) $(CFLAGS_ALL) $^ $(LIBS) -o $@
 link_rig = @mkdir -p $(@D); $(if $(V),,echo '  LD $@';) $(CC) $(CFLAGS_ALL) $^
-$(BUILD)/bin/rigd: $(call object,rigd/main.c rigd/daemon.c) $(BUILD)/librig.a $(BUILD)/libstudiorig.a
+$(BUILD)/bin/rigd: $(call object,rigd/main.c rigd/daemon.c) $(BUILD)/librig.a $(BUILD)/libtake.a
 	$(link_rig) $(LIBS_RIG) -o $@
-$(BUILD)/bin/rigctl: $(call object,rigd/rigctl.c) $(BUILD)/librig.a $(BUILD)/libstudiorig.a
+$(BUILD)/bin/rigctl: $(call object,rigd/rigctl.c) $(BUILD)/librig.a $(BUILD)/libtake.a
 	$(link_rig) $(LIBS_RIG) -o $@
-$(BUILD)/bin/rigd-camera: $(call object,rigd/camera_worker.c rigd/camera_gphoto.c rigd/ingest.c) $(BUILD)/librig.a $(BUILD)/libstudiorig.a
+$(BUILD)/bin/rigd-camera: $(call object,rigd/camera_worker.c rigd/camera_gphoto.c rigd/ingest.c) $(BUILD)/librig.a $(BUILD)/libtake.a
 	$(link_rig) $(LIBS_CAMERA) -o $@
 $(BUILD)/tests/%: $(BUILD)/obj/tests/%.o $(BUILD)/libstudiorig.a
 	@mkdir -p $(@D)
 	@$(if $(V),,echo '  LD $@')
 	$(Q)$(CC) $(CFLAGS_ALL) $^ -lcmocka $(LIBS) -o $@
-$(addprefix $(BUILD)/tests/,$(RIG_TESTS)): $(BUILD)/tests/%: $(BUILD)/obj/tests/%.o $(BUILD)/librig.a $(BUILD)/libstudiorig.a
+$(addprefix $(BUILD)/tests/,$(RIG_TESTS)): $(BUILD)/tests/%: $(BUILD)/obj/tests/%.o $(BUILD)/librig.a $(BUILD)/libtake.a
 	$(link_rig) -lcmocka $(LIBS_RIG) -o $@
 $(BUILD)/tests/bench/stability_joint: $(call object,solver/commands/arguments.c)
 $(BUILD)/tests/test_pcg: LIBS += $(if $(wildcard /usr/include/suitesparse/cholmod.h),-lcholmod)

@@ -90,6 +90,12 @@ char *camera_command_encode(const struct camera_command *c, size_t *n_bytes)
     }
     put_int(doc, "quiet_ms", c->quiet_ms);
     put_int(doc, "n_objects", c->n_objects);
+    if (c->n_after) {
+        struct json *list = json_new_array();
+        for (int i = 0; i < c->n_after; i++)
+            put_object(list, NULL, &c->after[i]);
+        json_set(doc, "after", list);
+    }
     put_object(doc, "object", &c->object);
     put_string(doc, "path", c->path);
     put_string(doc, "xxh128", c->xxh128);
@@ -157,7 +163,6 @@ char *camera_event_encode(const struct camera_event *e, size_t *n_bytes)
     put_int(doc, "size", e->size_bytes);
     put_string(doc, "xxh128", e->xxh128);
     put_int(doc, "at_ns", e->at_ns);
-    put_object(doc, "newest", &e->newest);
     if (e->more)
         json_set_bool(doc, "more", true);
     const int n = e->kind == CAMERA_OBJECT ? 1 : e->n_listed;
@@ -287,6 +292,9 @@ int camera_command_decode(struct camera_command *out, const char *text, size_t n
     }
     out->quiet_ms = (uint32_t)take_int(&r, "quiet_ms", 0, UINT32_MAX);
     out->n_objects = (int)take_int(&r, "n_objects", 0, 1000);
+    out->n_after = take_length(&r, "after", CAMERA_STORES_MAX);
+    for (int i = 0; i < out->n_after; i++)
+        take_object(&r, element(key, "after", i), &out->after[i]);
     take_object(&r, "object", &out->object);
     take_string(&r, "path", out->path, sizeof(out->path));
     r.bad |= out->path[0] && out->path[0] != '/';
@@ -359,7 +367,6 @@ int camera_event_decode(struct camera_event *out, const char *text, size_t n_byt
     out->size_bytes = take_int(&r, "size", 0, INT64_MAX);
     take_hex(&r, out->xxh128);
     out->at_ns = take_int(&r, "at_ns", 0, INT64_MAX);
-    take_object(&r, "newest", &out->newest);
     out->more = take_bool(&r, "more");
     out->n_listed = take_length(&r, "objects", CAMERA_LISTING_MAX);
     for (int i = 0; i < out->n_listed; i++)
@@ -403,13 +410,24 @@ static int compare(int64_t a, int64_t b)
     return (a > b) - (a < b);
 }
 
+static size_t store_length(const char *folder)
+{
+    const size_t slash = folder[0] == '/';
+    return slash + strcspn(folder + slash, "/");
+}
+
+bool camera_same_store(const struct camera_object *a, const struct camera_object *b)
+{
+    const size_t n = store_length(a->folder);
+    return n == store_length(b->folder) && !strncmp(a->folder, b->folder, n);
+}
+
 int camera_object_order(const struct camera_object *a, const struct camera_object *b)
 {
-    const size_t store_a = strcspn(a->folder + (a->folder[0] == '/'), "/");
-    const size_t store_b = strcspn(b->folder + (b->folder[0] == '/'), "/");
-    int order = strncmp(a->folder, b->folder, 1 + (store_a < store_b ? store_a : store_b));
+    const size_t n_a = store_length(a->folder), n_b = store_length(b->folder);
+    int order = strncmp(a->folder, b->folder, n_a < n_b ? n_a : n_b);
     if (!order)
-        order = compare((int64_t)store_a, (int64_t)store_b);
+        order = compare((int64_t)n_a, (int64_t)n_b);
     if (!order)
         order = compare(folder_number(a->folder), folder_number(b->folder));
     if (!order)

@@ -21,6 +21,7 @@ enum {
     CAMERA_FD = 3,
     CAMERA_SETTINGS_MAX = 24, // per camera
     CAMERA_LISTING_MAX = 64,  // objects per answer
+    CAMERA_STORES_MAX = 4,    // cards per body
 };
 
 // Neutral names ("iso", "shutter", ...: config/cameras/*.conf translates them for a family of bodies).
@@ -40,11 +41,14 @@ enum camera_command_kind {
     CAMERA_OPEN,      // connect to port; check the serial; -> facts. Once more on an open camera: close it first
     CAMERA_CONFIGURE, // write those settings that differ, read all of them back -> settings
     CAMERA_STATUS,    // battery, card, clock, lens -> status
-    CAMERA_DRAIN,     // read events until quiet_ms passed without one -> n_objects; each object an OBJECT before
+    CAMERA_DRAIN,     // read events until quiet_ms passed without one -> n_objects; each object an OBJECT before. Not quiet in
+                      // time: FAILED, busy
     CAMERA_TRIGGER,   // release the shutter through the driver (unsynchronised) -> pressed_ns
-    CAMERA_COLLECT,   // wait until n_objects new objects were announced, each an OBJECT -> n_objects
-    CAMERA_LIST,      // refresh the card's listing -> the newest object, and up to CAMERA_LISTING_MAX after `object`
-    CAMERA_FETCH,     // copy object to path: written, hashed, synced, read back, then named -> size, xxh128
+    CAMERA_COLLECT,   // wait until n_objects new objects were announced, each an OBJECT -> n_objects; fewer in time is DONE too
+    CAMERA_LIST,      // refresh the card's listing. n_objects 0: -> the newest object of each store. Else -> up to n_objects
+                      // (and CAMERA_LISTING_MAX) in DCF order that are later than after[] of their store, `more` if not all
+    CAMERA_FETCH,     // copy object to path: written, hashed, synced, read back, then named -> size, xxh128. A file of the object's
+                      // size that is there already is whole (nothing else gets that name): it is hashed instead
     CAMERA_THUMBNAIL, // likewise the object's preview (JPEG) -> size, xxh128
     CAMERA_DELETE,    // delete object from the card, after hashing the copy at path once more: it must equal xxh128
     CAMERA_IDENTIFY,  // make the body notice itself for some seconds (live view, beep): a person is looking for it
@@ -65,13 +69,15 @@ struct camera_command {
     // CONFIGURE
     int n_settings;
     struct camera_setting setting[CAMERA_SETTINGS_MAX];
-    // DRAIN, COLLECT
+    // DRAIN, COLLECT, LIST
     uint32_t quiet_ms;
     int n_objects;
-    // LIST (after it; folder "" = only count and newest), FETCH, THUMBNAIL, DELETE
+    int n_after;
+    struct camera_object after[CAMERA_STORES_MAX];
+    // FETCH, THUMBNAIL, DELETE
     struct camera_object object;
-    char path[512];     // FETCH, THUMBNAIL: must not exist yet; DELETE: the copy
-    char xxh128[33];    // DELETE; FETCH: "" or what an earlier copy of this object had
+    char path[512];     // FETCH, THUMBNAIL: of the copy; nothing is replaced. DELETE: the copy
+    char xxh128[33];    // DELETE
 };
 
 // What kind of trouble, and with it who can help. Beside it an errno and a sentence for people.
@@ -127,11 +133,10 @@ struct camera_event {
     struct camera_status status;
     int n_settings;
     struct camera_setting_found setting[CAMERA_SETTINGS_MAX];
-    int n_objects;                     // DRAIN, COLLECT: announced; LIST: on the card
+    int n_objects;                     // DRAIN, COLLECT: announced; LIST: on the cards
     int64_t pressed_ns;                // TRIGGER
     int n_listed;                      // LIST: in object[], in DCF order
     bool more;                         // LIST: there are newer ones than listed
-    struct camera_object newest;       // LIST; folder "" on an empty card
     struct camera_object object[CAMERA_LISTING_MAX]; // LIST; OBJECT: [0]
     int64_t size_bytes;                // FETCH, THUMBNAIL; PROGRESS: so far
     char xxh128[33];                   // FETCH, THUMBNAIL: 32 lower-case hex digits
@@ -145,6 +150,7 @@ char *camera_event_encode(const struct camera_event *e, size_t *n_bytes);
 int camera_command_decode(struct camera_command *out, const char *text, size_t n_bytes);
 int camera_event_decode(struct camera_event *out, const char *text, size_t n_bytes);
 
+bool camera_same_store(const struct camera_object *a, const struct camera_object *b);
 // < 0, 0, > 0 as a was written to the card before b, in DCF order. Stores are ordered by name.
 int camera_object_order(const struct camera_object *a, const struct camera_object *b);
 

@@ -66,7 +66,7 @@ void rig_start(struct rig *rig, int64_t now_ns); // once, first: opens every cam
 void rig_time(struct rig *rig, int64_t now_ns);
 void rig_camera_event(struct rig *rig, int64_t now_ns, int camera, const struct camera_event *e);
 void rig_worker_gone(struct rig *rig, int64_t now_ns, int camera, const char *how); // "killed by SIGSEGV", "exit 1", "cannot start: ..."
-void rig_trigger_is(struct rig *rig, int64_t now_ns, unsigned abilities);           // trigger_abilities(); 0: none, broken
+void rig_trigger_is(struct rig *rig, int64_t now_ns, int abilities);                // trigger_abilities(); -1: no trigger, or a broken one
 void rig_fired(struct rig *rig, int64_t now_ns, int err, int64_t pressed_ns, int64_t late_ns);
 void rig_feedback(struct rig *rig, int64_t now_ns, int camera, int64_t at_ns);
 void rig_press_camera(struct rig *rig, int64_t now_ns, int camera); // trigger_host.press_camera
@@ -112,6 +112,7 @@ int rig_n_findings(const struct rig *rig);
 const struct rig_finding *rig_finding(const struct rig *rig, int i);
 
 enum take_state rig_state(const struct rig *rig); // of the take under way, TAKE_IDLE without one
+const char *rig_outcome(const struct rig *rig);   // why the last take, preflight or calibration failed; "": it did not
 bool rig_is_busy(const struct rig *rig);          // capture would be refused
 const struct ledger *rig_ledger(const struct rig *rig); // of the take under way or the last one; NULL: none yet
 void rig_set_lag(struct rig *rig, const struct lag *lag); // as read from lag.json

@@ -35,6 +35,9 @@ static void every_command_survives_the_way(void **state)
             fill(c.setting[i].value, sizeof(c.setting[i].value), "1/", i);
         }
         c.quiet_ms = 200, c.n_objects = 2;
+        c.n_after = CAMERA_STORES_MAX;
+        for (int i = 0; i < c.n_after; i++)
+            c.after[i] = (struct camera_object){ "/store_00010001/DCIM/100NIKON", "DSC_0001.NEF", -1 };
         c.object = (struct camera_object){ "/store_00010001/DCIM/100NIKON", "DSC_0001.NEF", (int64_t)5 << 32 };
         strcpy(c.path, "/var/lib/rigd/takes/t/raw/A01.nef");
         strcpy(c.xxh128, "0123456789abcdef0123456789abcdef");
@@ -68,7 +71,6 @@ static void the_longest_answer_fits_into_a_message(void **state)
         memset(e.object[i].name, 'y', sizeof(e.object[i].name) - 1);
         e.object[i].size_bytes = INT64_MAX;
     }
-    e.newest = e.object[0];
     size_t n;
     char *text = camera_event_encode(&e, &n);
     assert_true(n < CAMERA_MESSAGE_MAX);
@@ -140,6 +142,7 @@ static void cards_are_read_in_the_order_they_were_written(void **state)
         for (int j = 0; j < N; j++) {
             const int o = camera_object_order(&order[i], &order[j]);
             assert_int_equal((o > 0) - (o < 0), (i > j) - (i < j));
+            assert_int_equal(camera_same_store(&order[i], &order[j]), (i < N - 1) == (j < N - 1));
         }
 }
 
