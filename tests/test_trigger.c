@@ -480,7 +480,7 @@ static void one_shot_is_three_calls_to_the_chip(void **state)
     struct trigger_lines *t = open_fake(85);
     assert_int_equal(trigger_lines_abilities(t), TRIGGER_SYNCHRONISED | TRIGGER_HALF_PRESS | TRIGGER_DELAYS | TRIGGER_FEEDBACK |
         TRIGGER_BUTTON | TRIGGER_RELAYS);
-    const struct trigger_shot shot = { .at_ns = clock_ns() + 60 * MS, .half_ms = 30, .hold_ms = 20 };
+    const struct trigger_shot shot = { .at_ns = clock_ns() + 250 * MS, .half_ms = 200, .hold_ms = 20 };
     assert_int_equal(trigger_lines_fire(t, &shot), 0);
     assert_int_equal(trigger_lines_fire(t, &shot), -EBUSY);
     serve(t, &heard.n_fired, 1);
@@ -489,7 +489,7 @@ static void one_shot_is_three_calls_to_the_chip(void **state)
     assert_int_equal(n_active(0), 85);
     assert_int_equal(n_active(1), 170);
     assert_int_equal(n_active(2), 0);
-    assert_true(chip->set[0].at_ns >= shot.at_ns - 30 * MS); // never early
+    assert_true(chip->set[0].at_ns >= shot.at_ns - 200 * MS); // never early
     assert_true(chip->set[1].at_ns >= shot.at_ns);
     assert_true(chip->set[2].at_ns - chip->set[1].at_ns >= 20 * MS); // never short
     assert_true(heard.pressed_ns >= chip->set[1].at_ns && heard.pressed_ns < chip->set[2].at_ns);
@@ -509,11 +509,9 @@ static void release_in_the_middle_opens_everything_and_says_so_once(void **state
 {
     (void)state;
     struct trigger_lines *t = open_fake(3);
-    const struct trigger_shot shot = { .at_ns = clock_ns() + 20 * MS, .half_ms = 10, .hold_ms = 2500 };
     for (int round = 1; round <= 2; round++) { // and the next shot is a new one
-        struct trigger_shot s = shot;
+        const struct trigger_shot s = { .at_ns = clock_ns() + 200 * MS, .half_ms = 150, .hold_ms = 2500 };
         const int before = chip->n_sets;
-        s.at_ns = clock_ns() + 20 * MS;
         assert_int_equal(trigger_lines_fire(t, &s), 0);
         wait_for_sets(before + 2);
         trigger_lines_release(t);
@@ -536,7 +534,7 @@ static void a_line_that_breaks_in_the_middle_releases_all_and_tells_once(void **
         struct trigger_lines *t = open_fake(4);
         chip->failing = failing;
         assert_int_equal(trigger_lines_relay(t, 2, false), 0);
-        const struct trigger_shot shot = { .at_ns = clock_ns() + 30 * MS, .half_ms = 10, .hold_ms = 10 };
+        const struct trigger_shot shot = { .at_ns = clock_ns() + 200 * MS, .half_ms = 150, .hold_ms = 10 };
         assert_int_equal(trigger_lines_fire(t, &shot), 0);
         serve(t, &heard.n_broken, 1);
         assert_int_equal(heard.n_fired, 1);
@@ -612,8 +610,9 @@ static void killed_in_the_middle_the_guard_lets_go(void **state)
     const pid_t pid = process_that_presses(SIGKILL, 10000);
     assert_int_equal(waitpid(pid, &status, 0), pid);
     assert_true(WIFSIGNALED(status) && WTERMSIG(status) == SIGKILL);
-    wait_for_sets(3); // long before the 10 s of the limit, or wait_for_sets would have given up
+    wait_for_sets(3);
     assert_int_equal(n_active(2), 0);
+    assert_true(chip->set[2].at_ns - chip->set[1].at_ns < 9000 * MS); // not only at the limit of 10 s
     assert_int_not_equal(chip->set[2].by, pid);
     for (int i = 0; kill(chip->set[2].by, 0) == 0 && i < 1000; i++) // and leaves; who adopted it may take a while to see it
         poll(NULL, 0, 1);
@@ -623,7 +622,7 @@ static void stopped_in_the_middle_the_guard_lets_go_at_the_limit(void **state)
 {
     (void)state;
     int status;
-    const pid_t pid = process_that_presses(SIGSTOP, 300);
+    const pid_t pid = process_that_presses(SIGSTOP, 1200);
     wait_for_sets(3);
     while (n_active(chip->n_sets - 1) > 0)
         poll(NULL, 0, 1);
@@ -785,10 +784,10 @@ static void the_simulated_rig_gets_exact_times_and_answers(void **state)
     const int rigsim = accept(listening, NULL, NULL);
 
     uint32_t delay_us[200] = { [7] = 1234 };
-    const struct trigger_shot shot = { .at_ns = clock_ns() + 50 * MS, .half_ms = 20, .hold_ms = 10, .delay_us = delay_us };
+    const struct trigger_shot shot = { .at_ns = clock_ns() + 200 * MS, .half_ms = 150, .hold_ms = 10, .delay_us = delay_us };
     assert_int_equal(trigger_fire(t, &shot), 0);
     const struct { int n, line, level; int64_t at_ns; } expected[] = {
-        { 200, SHUTTER_LINE_HALF, 1, shot.at_ns - 20 * MS },
+        { 200, SHUTTER_LINE_HALF, 1, shot.at_ns - 150 * MS },
         { 199, SHUTTER_LINE_FULL, 1, shot.at_ns },
         { 1, SHUTTER_LINE_FULL, 1, shot.at_ns + 1234000 },
         { 398, 0, 0, shot.at_ns + 10 * MS },
