@@ -40,24 +40,29 @@ SOLVER := $(addprefix solver/,alternating.c cameras.c cameras_bundler.c cameras_
 KERNELS := $(addprefix solver/kernels/,kernels.c kernels_ref.c kernels_portable.c kernels_avx2.c kernels_avx512.c)
 COMMANDS := $(addprefix solver/commands/,arguments.c brdf.c compare.c export.c inputs.c lights.c output.c render.c report.c solve.c solve_materials.c solved.c synth.c visibility.c)
 LIBRARY := $(TAKE) $(SOLVER) $(KERNELS)
+RIG := $(addprefix rigd/,calibrate.c camera.c config.c control.c describe.c digest.c doctor.c edges.c ledger.c manifest.c rig.c trigger.c trigger_gpio.c trigger_lines.c trigger_sim.c trigger_software.c)
+RIG_PROGRAMS := rigctl rigd
+LIBS_RIG = -ljansson -linih -lsystemd -lxxhash -lgpiod -lm
+LIBS_CAMERA = -lgphoto2 -lgphoto2_port -ljansson -lxxhash -lm
 FUZZED := $(TAKE) $(addprefix solver/,cameras.c cameras_bundler.c cameras_colmap.c cameras_format.c cameras_meshroom.c \
   cameras_metashape.c cameras_realitycapture.c csv.c lights.c mesh.c mesh_gltf_floats.c mesh_import.c orientation.c panorama.c parallel.c \
   picture_size.c texels.c xml.c)
 TESTS := $(addprefix test_,alternating brdf cameras cameras_import compare csv disney emitters export gltf_brdf image joint json judge levels \
   lights lm materials mesh misfit normal_equations orientation panorama parallel pcg photometric rays render report samples shapes stability \
   synth take texels vec3 visibility) check_kernels
+RIG_TESTS := $(addprefix test_,camera config control digest manifest rig trigger)
 FUZZERS := cameras cameras_import csv exr hdr json lights mesh
 
 # ---- rules --------------------------------------------------------------------------------------------------------------
 object = $(patsubst %.c,$(BUILD)/obj/%.o,$(1))
-ifneq ($(filter test demo bench chart figure5 figures stability experiments,$(MAKECMDGOALS)),)
+ifneq ($(filter test test-vm demo bench chart figure5 figures stability experiments,$(MAKECMDGOALS)),)
 FIRST := deps # these install what is missing before the first file is compiled
 endif
-.PHONY: all deps deps-fuzz deps-bench test demo bench chart figure5 figures stability experiments fuzz check-includes man install clean help
+.PHONY: all deps deps-fuzz deps-bench test test-vm demo bench chart figure5 figures stability experiments fuzz check-includes man install clean help
 .DELETE_ON_ERROR:
 .SECONDARY:
 
-all: $(BUILD)/bin/rigsolve
+all: $(BUILD)/bin/rigsolve $(addprefix $(BUILD)/bin/,$(RIG_PROGRAMS))
 
 $(BUILD)/obj/%.o: %.c Makefile | $(FIRST)
 	@mkdir -p $(@D)
@@ -74,14 +79,31 @@ $(BUILD)/libstudiorig.a: $(call object,$(LIBRARY))
 	@rm -f $@
 	@$(if $(V),,echo '  AR $@')
 	$(Q)ar rcsD $@ $^
+$(BUILD)/libtake.a: $(call object,$(TAKE))
+	@rm -f $@
+	@$(if $(V),,echo '  AR $@')
+	$(Q)ar rcsD $@ $^
+$(BUILD)/librig.a: $(call object,$(RIG))
+	@rm -f $@
+	@$(if $(V),,echo '  AR $@')
+	$(Q)ar rcsD $@ $^
 $(BUILD)/bin/rigsolve: $(call object,$(COMMANDS) solver/main.c) $(BUILD)/libstudiorig.a
 	@mkdir -p $(@D)
 	@$(if $(V),,echo '  LD $@')
 	$(Q)$(CC) $(CFLAGS_ALL) $^ $(LIBS) -o $@
+link_rig = @mkdir -p $(@D); $(if $(V),,echo '  LD $@';) $(CC) $(CFLAGS_ALL) $^
+$(BUILD)/bin/rigd: $(call object,rigd/main.c rigd/daemon.c) $(BUILD)/librig.a $(BUILD)/libtake.a
+	$(link_rig) $(LIBS_RIG) -o $@
+$(BUILD)/bin/rigctl: $(call object,rigd/rigctl.c) $(BUILD)/librig.a $(BUILD)/libtake.a
+	$(link_rig) $(LIBS_RIG) -o $@
+$(BUILD)/bin/rigd-camera: $(call object,rigd/camera_worker.c rigd/camera_gphoto.c rigd/ingest.c) $(BUILD)/librig.a $(BUILD)/libtake.a
+	$(link_rig) $(LIBS_CAMERA) -o $@
 $(BUILD)/tests/%: $(BUILD)/obj/tests/%.o $(BUILD)/libstudiorig.a
 	@mkdir -p $(@D)
 	@$(if $(V),,echo '  LD $@')
 	$(Q)$(CC) $(CFLAGS_ALL) $^ -lcmocka $(LIBS) -o $@
+$(addprefix $(BUILD)/tests/,$(RIG_TESTS)): $(BUILD)/tests/%: $(BUILD)/obj/tests/%.o $(BUILD)/librig.a $(BUILD)/libtake.a
+	$(link_rig) -lcmocka $(LIBS_RIG) -o $@
 $(BUILD)/tests/bench/stability_joint: $(call object,solver/commands/arguments.c)
 $(BUILD)/tests/test_pcg: LIBS += $(if $(wildcard /usr/include/suitesparse/cholmod.h),-lcholmod)
 $(BUILD)/fuzz/obj/%.o: %.c Makefile | deps-fuzz
@@ -104,9 +126,13 @@ deps-fuzz: ; $(call install_packages,$(PACKAGES_FUZZ))
 deps-bench: deps ; $(call install_packages,$(PACKAGES_BENCH))
 
 # ---- tests ----------------------------------------------------------------------------------------------------------------
-TEST_PROGRAMS := $(addprefix $(BUILD)/tests/,$(TESTS))
-test: deps $(BUILD)/bin/rigsolve $(TEST_PROGRAMS)
-	@CMOCKA_MESSAGE_OUTPUT=TAP BIN=$(BUILD)/bin prove --timer --merge --exec '' tests/check_includes.sh $(TEST_PROGRAMS) tests/test_commands.sh
+TEST_PROGRAMS := $(addprefix $(BUILD)/tests/,$(TESTS) $(RIG_TESTS))
+test: deps all $(TEST_PROGRAMS)
+	@CMOCKA_MESSAGE_OUTPUT=TAP BIN=$(BUILD)/bin prove --timer --merge --exec '' tests/check_includes.sh tests/check_gpiod.sh $(TEST_PROGRAMS) tests/test_commands.sh
+$(BUILD)/tests/vm/test_gpio_vm: $(BUILD)/obj/tests/vm/test_gpio_vm.o $(BUILD)/librig.a $(BUILD)/libtake.a
+	$(link_rig) -Wl,--as-needed -lcmocka $(LIBS_RIG) -o $@
+test-vm: deps $(BUILD)/tests/vm/test_gpio_vm
+	@prove --timer --verbose --exec '' tests/vm/run.sh :: $(BUILD)/vm $(BUILD)/tests/vm/test_gpio_vm
 check-includes:
 	@prove --exec '' tests/check_includes.sh
 
@@ -166,6 +192,7 @@ clean:
 help:
 	@echo 'make            build/bin/rigsolve                make test      everything that must hold (installs packages)'
 	@echo 'make demo       a synthetic studio, end to end    make fuzz      libFuzzer on every parser (FUZZ_SECONDS=60)'
+	@echo 'make test-vm    GPIO on a simulated chip, in a virtual machine'
 	@echo 'make bench      seconds and errors of kernels     make chart     speed against accuracy      make stability  where it fails'
 	@echo 'make install    DESTDIR= PREFIX=/usr/local        make deps      Debian packages             make clean'
 	@echo 'variants: VARIANT=debug|asan|tsan; V=1 shows commands'
