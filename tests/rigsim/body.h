@@ -33,6 +33,7 @@ struct body_object {
     int file;          // FILES_RAW or FILES_JPEG; 0: folder
     uint64_t size;     // as it was measured
     uint64_t told;     // size to report and send: less than size for a short object
+    uint32_t thumbnail_bytes; // 0: not made yet
     char name[24];
     struct exposure exposure;
 };

@@ -68,6 +68,21 @@ void ptp_send_thumbnail(struct ptp_session *s, uint32_t handle, struct ptp_reply
         reply->has_data = true;
 }
 
+// Clients take a thumbnail of 0 bytes for none: its size must be known here.
+void ptp_send_object_info(struct ptp_session *s, uint32_t handle, struct ptp_reply *reply)
+{
+    struct body_object *o = body_object(s->body, handle);
+    if (!o) {
+        reply->code = PTP_INVALID_HANDLE;
+        return;
+    }
+    if (o->file && !o->thumbnail_bytes && s->thumbnail && !s->thumbnail(s->arg, s->body, o, &reply->data))
+        o->thumbnail_bytes = (uint32_t)reply->data.n;
+    dataset_clear(&reply->data);
+    ptp_put_object_info(&reply->data, s->body, o, s->width_px, s->height_px);
+    reply->has_data = true;
+}
+
 static bool is_in(const struct body_object *o, uint32_t format, uint32_t parent)
 {
     if (o->in_ram || (format && format != ALL && format != o->format))
@@ -141,7 +156,6 @@ static void standard(struct ptp_session *s, const struct ptp_request *q, struct 
 {
     struct body *b = s->body;
     const struct personality *p = b->personality;
-    const struct body_object *o;
     switch (q->code) {
     case GET_DEVICE_INFO:
         ptp_put_device_info(&reply->data, b);
@@ -174,13 +188,7 @@ static void standard(struct ptp_session *s, const struct ptp_request *q, struct 
         list_objects(s, q, reply);
         return;
     case GET_OBJECT_INFO:
-        o = body_object(b, q->param[0]);
-        if (!o) {
-            reply->code = PTP_INVALID_HANDLE;
-            return;
-        }
-        ptp_put_object_info(&reply->data, b, o, s->width_px, s->height_px);
-        reply->has_data = true;
+        ptp_send_object_info(s, q->param[0], reply);
         return;
     case GET_OBJECT:
         ptp_send_object(s, q->param[0], 0, UINT64_MAX, reply);

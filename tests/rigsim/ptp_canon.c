@@ -256,14 +256,9 @@ bool ptp_canon_answer(struct ptp_session *s, const struct ptp_request *q, struct
     case GET_THUMB_EX:
         ptp_send_thumbnail(s, q->param[0], reply);
         return true;
-    case GET_OBJECT_INFO: {
-        const struct body_object *o = body_object(b, q->param[0]);
-        reply->code = o ? PTP_OK : PTP_INVALID_HANDLE;
-        if (o)
-            ptp_put_object_info(&reply->data, b, o, s->width_px, s->height_px);
-        reply->has_data = o;
+    case GET_OBJECT_INFO:
+        ptp_send_object_info(s, q->param[0], reply);
         return true;
-    }
     case DELETE_OBJECT:
         reply->code = body_delete(b, q->param[0]);
         return true;

@@ -4,7 +4,7 @@
 #include <string.h>
 #include <time.h>
 
-enum { STANDARD_VERSION = 100, FUNCTIONAL_MODE = 0, THUMB_FORMAT = 0x3808, FOLDER = 0x3001 };
+enum { STANDARD_VERSION = 100, FUNCTIONAL_MODE = 0, THUMB_FORMAT = 0x3808, THUMB_WIDTH = 160 };
 
 void ptp_put_value(struct dataset *d, enum property_type type, int64_t value, const char *text)
 {
@@ -125,9 +125,9 @@ void ptp_put_object_info(struct dataset *d, const struct body *b, const struct b
     dataset_u16(d, 0); // no protection
     dataset_u32(d, (uint32_t)o->told);
     dataset_u16(d, o->file ? THUMB_FORMAT : 0);
-    dataset_u32(d, 0); // the thumbnail's size is known when it is asked for
-    dataset_u32(d, o->file ? 160 : 0);
-    dataset_u32(d, o->file ? 120 : 0);
+    dataset_u32(d, o->thumbnail_bytes);
+    dataset_u32(d, o->file ? THUMB_WIDTH : 0);
+    dataset_u32(d, o->file ? THUMB_WIDTH * height_px / width_px : 0);
     dataset_u32(d, o->file ? width_px : 0);
     dataset_u32(d, o->file ? height_px : 0);
     dataset_u32(d, o->file == FILES_RAW ? 14 : o->file ? 24 : 0);

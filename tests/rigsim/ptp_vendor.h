@@ -10,5 +10,6 @@ bool ptp_canon_answer(struct ptp_session *s, const struct ptp_request *q, struct
 void ptp_queue_event(struct ptp_session *s, uint16_t code, uint32_t param);
 // Answers with the bytes [offset, offset + n) of an object, cut at its end; reply->param[0] is how many.
 void ptp_send_object(struct ptp_session *s, uint32_t handle, uint64_t offset, uint64_t n, struct ptp_reply *reply);
+void ptp_send_object_info(struct ptp_session *s, uint32_t handle, struct ptp_reply *reply);
 void ptp_send_thumbnail(struct ptp_session *s, uint32_t handle, struct ptp_reply *reply);
 int ptp_find_property(const struct ptp_session *s, uint32_t code); // index, or -1
