@@ -777,12 +777,12 @@ int gphoto_status(struct gphoto *g, struct camera_event *e)
     struct storage storage;
     char text[64];
     *s = (struct camera_status){ -1, -1, -1, -1, NAN, -1, -1, -1, "" };
-    int got = ask_body_once(g, "battery", text, sizeof(text), e);
-    if (got > 0 && isdigit((unsigned char)text[0])) {
-        const long percent = strtol(text, NULL, 10);
+    int got, i = 0;
+    while ((got = ask_body(g, "battery", &i, text, sizeof(text), e)) > 0 && s->battery_percent < 0) {
+        const long percent = isdigit((unsigned char)text[0]) ? strtol(text, NULL, 10) : -1;
         s->battery_percent = percent > 100 ? 100 : (int)percent;
-    } else if (got > 0 && !strcasecmp(text, "Low")) {
-        s->battery_percent = 5; // the last step of a Canon EOS
+        if (!strcasecmp(text, "Low"))
+            s->battery_percent = 5; // the last step of a Canon EOS
     }
     if (got >= 0)
         got = ask_body_once(g, "lens", s->lens, sizeof(s->lens), e);
@@ -811,9 +811,9 @@ int gphoto_status(struct gphoto *g, struct camera_event *e)
         return got;
     read_storage(g, &storage);
     s->card_present = storage.n > 0;
-    for (int i = 0; i < storage.n; i++) {
-        const int64_t bytes = storage.store[i].free_kb == UINT64_MAX ? -1 : (int64_t)(storage.store[i].free_kb * 1024);
-        const int64_t images = storage.store[i].free_images == UINT64_MAX ? -1 : (int64_t)storage.store[i].free_images;
+    for (int k = 0; k < storage.n; k++) {
+        const int64_t bytes = storage.store[k].free_kb == UINT64_MAX ? -1 : (int64_t)(storage.store[k].free_kb * 1024);
+        const int64_t images = storage.store[k].free_images == UINT64_MAX ? -1 : (int64_t)storage.store[k].free_images;
         s->free_bytes = bytes > s->free_bytes ? bytes : s->free_bytes;
         s->free_images = images > s->free_images ? images : s->free_images;
     }

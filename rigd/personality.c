@@ -310,7 +310,7 @@ static const char *decimal(const char *s, double *out)
     return n_digits ? s : NULL;
 }
 
-// "f/5.6", "F8", "1/125", "10/25", "0.0080s", "5600 K", "ISO 200": a number above 0 and all of the text.
+// "f/5.6", "F8", "1/125", "10/25", "0.0080s", "2m", "5600 K", "ISO 200": a number above 0 and all of the text.
 static bool quantity(const char *s, double *out)
 {
     double v, below = 1;
@@ -326,9 +326,12 @@ static bool quantity(const char *s, double *out)
         s = decimal(s + 1, &below);
     if (!s || !(below > 0) || !(v > 0))
         return false;
+    if (v > 65000 && below > 65000)
+        return false; // bulb and time, as Nikon writes them
     s += strspn(s, " ");
-    s += *s == 's' || *s == 'K';
-    *out = v / below;
+    const double unit = *s == 'm' ? 60 : 1;
+    s += *s == 's' || *s == 'm' || *s == 'K';
+    *out = v / below * unit;
     return !*s;
 }
 
