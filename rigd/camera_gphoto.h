@@ -13,6 +13,7 @@ struct gphoto;
 int gphoto_create(struct gphoto **out, void (*gone)(void *arg), void *arg);
 void gphoto_free(struct gphoto *g);
 void gphoto_deadline(struct gphoto *g, int64_t at_ns); // of what follows
+void gphoto_rest(struct gphoto *g); // nothing is to be done: give memory back
 
 // personality stays the caller's until the next gphoto_open() or gphoto_free().
 int gphoto_open(struct gphoto *g, const struct camera_command *c, const struct personality *personality, struct camera_event *e);

@@ -319,6 +319,7 @@ int main(int argc, char **argv)
         w.answer.kind = err < 0 ? CAMERA_FAILED : CAMERA_DONE;
         tidy(&w.answer);
         say(&w.answer);
+        gphoto_rest(w.camera);
     }
     gphoto_close(w.camera); // a farewell, as the daemon closed its end in peace
     return 0;
