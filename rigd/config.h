@@ -43,7 +43,7 @@ struct trigger_config {      // [trigger]
 struct config {
     // [rig]
     char name[64];
-    char takes_dir[512], socket_path[108], state_dir[512]; // state_dir: lag.json
+    char takes_dir[300], socket_path[108], state_dir[300]; // state_dir: lag.json
     char personality_dir[256];
     int objects_per_shot;
     uint32_t raw_mb;             // largest raw, for the check of free space and free images

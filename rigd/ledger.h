@@ -25,7 +25,7 @@ struct ledger_object {
     char file[64];       // "raw/A01.nef", relative to the take
     char xxh128[33];     // of the copy; "" before
     int n_retries;
-    int64_t copied_ms;   // from the shot until the copy was safe; -1
+    int64_t copied_ms;   // from the shot until the copy was safe; -1 not known
 };
 
 enum debt { DEBT_OPEN, DEBT_PAID, DEBT_MISSED }; // all expected objects copied | given up, see note
@@ -38,6 +38,9 @@ struct ledger_camera {
     char note[200];             // why it was left out, missed or quarantined, and what to do
     int n_before;               // newest object of each store before the shot: everything later is the take's
     struct camera_object before[CAMERA_STORES_MAX];
+    bool has_until;             // a later take exists: what is later than until[], or on a store without one, belongs to it
+    int n_until;
+    struct camera_object until[CAMERA_STORES_MAX]; // not on disk: ledger_bound() finds it
     int64_t delay_us;           // lag compensation applied
     int64_t lag_ns;             // flash-sync after the press; INT64_MIN: not measured
     int n_settings;
@@ -62,9 +65,10 @@ struct ledger {
     struct ledger_camera *camera; // in the order of the configuration
 };
 
-void ledger_init(struct ledger *l, const struct config *config); // zeroed but for names; -ENOMEM shows as camera == NULL
+// Every configured camera expected, with an open debt. Out of memory: camera is NULL.
+void ledger_init(struct ledger *l, const struct config *config);
 void ledger_free(struct ledger *l);
-bool ledger_is_later(const struct ledger_camera *c, const struct camera_object *o); // than before[] of its store?
+bool ledger_owns(const struct ledger_camera *c, const struct camera_object *o); // later than before[], not later than until[]?
 struct ledger_object *ledger_find(struct ledger_camera *c, const struct camera_object *o); // same folder and name; NULL
 // A new object of a camera with the name of its copy: raw/<camera>.<ext>, the second of one extension raw/<camera>_2.<ext>.
 // NULL when there are LEDGER_OBJECTS_MAX already.
@@ -82,6 +86,9 @@ int ledger_create(const struct ledger *l, const char *takes_dir);
 // take back COPIED notes whose file is missing, short or different (the copy is set aside as <name>.damaged, never deleted).
 struct ledger_findings { int n_adopted, n_taken_back, n_parts_removed, n_strangers; };
 int ledger_reconcile(struct ledger *l, const char *take_dir, struct ledger_findings *found); // 0 or -errno (logged)
+
+// Which frames belong to this take and not to later ones: look at the ledgers in takes_dir that come after it. 0 or -errno (logged).
+int ledger_bound(struct ledger *l, const char *takes_dir);
 
 // Every object of every expected camera copied (or deleted after copying) and no debt left?
 bool ledger_is_whole(const struct ledger *l);

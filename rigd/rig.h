@@ -112,6 +112,7 @@ int rig_n_findings(const struct rig *rig);
 const struct rig_finding *rig_finding(const struct rig *rig, int i);
 
 enum take_state rig_state(const struct rig *rig); // of the take under way, TAKE_IDLE without one
+const char *rig_outcome(const struct rig *rig);   // why the last take, preflight or calibration failed; "": it did not
 bool rig_is_busy(const struct rig *rig);          // capture would be refused
 const struct ledger *rig_ledger(const struct rig *rig); // of the take under way or the last one; NULL: none yet
 void rig_set_lag(struct rig *rig, const struct lag *lag); // as read from lag.json
