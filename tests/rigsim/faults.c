@@ -146,7 +146,10 @@ int faults_parse(struct faults *out, const char *text, const char *name_for_erro
     *out = f;
     for (int line = 1; !err && *text; line++) {
         char buffer[LINE_BYTES];
-        const size_t whole_line = strcspn(text, "\n"), length = strcspn(text, "#\n");
+        const size_t whole_line = strcspn(text, "\n");
+        size_t length = strcspn(text, "#\n");
+        while (length < whole_line && length && text[length - 1] != ' ' && text[length - 1] != '\t') // 0x100e#2 is no comment
+            length += 1 + strcspn(text + length + 1, "#\n");
         if (length >= sizeof(buffer)) {
             err = fail(name_for_errors, line, "a long line", "less than 512 bytes");
             break;

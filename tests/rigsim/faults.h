@@ -1,6 +1,6 @@
 // tests/rigsim/faults.h - what goes wrong, when and with which camera: a script.
 //
-// One fault per line, '#' begins a comment:
+// One fault per line; '#' at its beginning or after a space begins a comment:
 //   CAMERAS WHEN FAULT [ARGUMENTS]
 // CAMERAS  A03 | A01,A07,B12 | A* | *
 // WHEN     at 2.5s            once, that long after the start

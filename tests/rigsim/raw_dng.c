@@ -160,8 +160,10 @@ int raw_dng_make(struct raw_dng *out, const struct raw_dng_info *i)
                     : NULL;
     uint64_t exif_at = 0;
     int ok = t && write_exif(t, i, date, subsec, &exif_at);
-    if (ok)
+    if (ok) { // libtiff drops the EXIF directory's texts unless they are freed here
+        TIFFFreeDirectory(t);
         TIFFCreateDirectory(t);
+    }
     ok = ok && write_main(t, i, date, exif_at);
     for (int y = 0, s = 0; ok && y < i->height_px; y += ROWS_PER_STRIP, s++) {
         const int rows = i->height_px - y < ROWS_PER_STRIP ? i->height_px - y : ROWS_PER_STRIP;
