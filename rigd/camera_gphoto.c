@@ -58,6 +58,7 @@ struct gphoto {
     CameraAbilities abilities;
     char port[64]; // the driver's
     bool usb;
+    bool linked;   // the driver's session is open
     bool broken;   // the link: nothing more is said on it
     void (*gone)(void *arg);
     void *arg;
@@ -217,12 +218,36 @@ static const char *remedy(const struct gphoto *g, enum camera_trouble trouble)
     }
 }
 
+static int read_storage(struct gphoto *g, struct storage *out);
+
+// A code and words that do not tell a refusal from a link that ended: the cards are asked for.
+static enum camera_trouble ask_what_it_was(struct gphoto *g)
+{
+    struct storage storage;
+    char said[sizeof(g->said)];
+    memcpy(said, g->said, sizeof(said));
+    const int code = read_storage(g, &storage);
+    memcpy(g->said, said, sizeof(said));
+    if (code < 0)
+        return code == GP_ERROR_CAMERA_BUSY ? CAMERA_BUSY : CAMERA_LOST;
+    bool full = storage.n > 0;
+    for (int i = 0; i < storage.n; i++)
+        full &= storage.store[i].free_images == 0;
+    if (full)
+        snprintf(g->said, sizeof(g->said), "its card is full");
+    return full ? CAMERA_CARD : said[0] ? CAMERA_BUSY : CAMERA_REFUSED; // General Error passes, a refusal without words does not
+}
+
 // Every call to the driver is checked by this: code < 0 becomes trouble, and doing says what was tried.
 static int failed(struct gphoto *g, struct camera_event *e, int code, int64_t began_ns, const char *doing)
 {
-    const enum camera_trouble trouble = trouble_of(g, code, began_ns);
+    enum camera_trouble trouble = trouble_of(g, code, began_ns);
+    if (trouble == CAMERA_LOST && code == GP_ERROR && g->linked)
+        trouble = ask_what_it_was(g);
     g->broken |= trouble == CAMERA_LOST || trouble == CAMERA_STALLED || trouble == CAMERA_BROKEN;
-    return gphoto_fail(e, trouble, 0, "%s: %.90s: %s", doing, g->said[0] ? g->said : gp_result_as_string(code), remedy(g, trouble));
+    const char *words = trouble == CAMERA_BUSY ? "it is busy" : trouble == CAMERA_STALLED ? "no answer"
+                        : g->said[0] ? g->said : gp_result_as_string(code);
+    return gphoto_fail(e, trouble, 0, "%s: %.90s: %s", doing, words, remedy(g, trouble));
 }
 
 static bool is_fatal(const struct gphoto *g, int code, int64_t began_ns)
@@ -302,7 +327,7 @@ void gphoto_free(struct gphoto *g)
 
 bool gphoto_is_open(const struct gphoto *g)
 {
-    return g->camera;
+    return g->linked && !g->broken;
 }
 
 void gphoto_rest(struct gphoto *g)
@@ -351,13 +376,15 @@ static void disconnect(struct gphoto *g)
     }
     gp_camera_exit(g->camera, g->context);
     g->n_links = 0;
+    g->linked = false;
 }
 
 void gphoto_close(struct gphoto *g)
 {
     if (!g->camera)
         return;
-    disconnect(g);
+    if (g->linked)
+        disconnect(g);
     gp_camera_unref(g->camera);
     close_leftover_links(g);
     g->camera = NULL;
@@ -449,21 +476,22 @@ static int find_port(struct gphoto *g, const char *port, bool reset, struct came
     return gphoto_fail(e, CAMERA_LOST, 0, "%.80s did not come back from a reset: switch it off and on", port);
 }
 
-static void read_storage(struct gphoto *g, struct storage *out)
+// The driver's code. Of all questions it is the one whose answer is never guessed, cached or swallowed by the driver.
+static int read_storage(struct gphoto *g, struct storage *out)
 {
     CameraStorageInformation *info = NULL;
     int n = 0;
     memset(out, 0, sizeof(*out));
-    begin(g);
-    if (gp_camera_get_storageinfo(g->camera, &info, &n, g->context) >= 0)
-        for (int i = 0; i < n && out->n < STORES_MAX; i++) {
-            if (strlen(info[i].basedir) >= sizeof(out->store[0].folder))
-                continue;
-            out->store[out->n].free_kb = info[i].fields & GP_STORAGEINFO_FREESPACEKBYTES ? info[i].freekbytes : UINT64_MAX;
-            out->store[out->n].free_images = info[i].fields & GP_STORAGEINFO_FREESPACEIMAGES ? info[i].freeimages : UINT64_MAX;
-            strcpy(out->store[out->n++].folder, info[i].basedir);
-        }
+    const int code = gp_camera_get_storageinfo(g->camera, &info, &n, g->context);
+    for (int i = 0; code >= 0 && i < n && out->n < STORES_MAX; i++) {
+        if (strlen(info[i].basedir) >= sizeof(out->store[0].folder))
+            continue;
+        out->store[out->n].free_kb = info[i].fields & GP_STORAGEINFO_FREESPACEKBYTES ? info[i].freekbytes : UINT64_MAX;
+        out->store[out->n].free_images = info[i].fields & GP_STORAGEINFO_FREESPACEIMAGES ? info[i].freeimages : UINT64_MAX;
+        strcpy(out->store[out->n++].folder, info[i].basedir);
+    }
     free(info);
+    return code == GP_ERROR_NOT_SUPPORTED ? GP_OK : code; // then nothing is known of its cards
 }
 
 static int connect_camera(struct gphoto *g, struct camera_event *e)
@@ -494,9 +522,11 @@ static int connect_camera(struct gphoto *g, struct camera_event *e)
             return gphoto_fail(e, CAMERA_LOST, -EBUSY, "another program holds %s: rigctl doctor names it", g->port);
         return failed(g, e, code, began, "cannot open it");
     }
+    g->linked = true;
     find_links(g);
-    read_storage(g, &g->storage);
-    return 0;
+    began = begin(g);
+    code = read_storage(g, &g->storage);
+    return code < 0 && is_fatal(g, code, began) ? failed(g, e, code, began, "cannot ask for its cards") : 0;
 }
 
 // ---- settings --------------------------------------------------------------------------------------------------------------
@@ -539,7 +569,9 @@ static int get_widget(struct gphoto *g, const char *name, CameraWidget **out, st
     if (code >= 0 && *out)
         return 1;
     *out = NULL;
-    return code < 0 && code != GP_ERROR_BAD_PARAMETERS && is_fatal(g, code, began) ? failed(g, e, code, began, "cannot read its settings") : 0;
+    if (now_ns() - began > 2000000000) // the driver takes no answer for a name that is not there
+        return failed(g, e, GP_ERROR_TIMEOUT, began, "cannot read its settings");
+    return code != GP_ERROR_BAD_PARAMETERS && is_fatal(g, code, began) ? failed(g, e, code, began, "cannot read its settings") : 0;
 }
 
 static int get_setting(struct gphoto *g, const char *setting, char driver[PERSONALITY_NAME], CameraWidget **out, struct camera_event *e)
@@ -623,9 +655,7 @@ int gphoto_open(struct gphoto *g, const struct camera_command *c, const struct p
         return gphoto_fail(e, CAMERA_BROKEN, -ENOMEM, "no memory");
     }
     if (connect_camera(g, e)) {
-        gp_camera_unref(g->camera);
-        g->camera = NULL;
-        close_leftover_links(g);
+        gphoto_close(g);
         return -1;
     }
     while ((got = ask_body(g, "serial", &i, serial, sizeof(serial), e)) > 0) {
@@ -693,6 +723,8 @@ static bool set_widget(struct gphoto *g, CameraWidget *w, const char *setting, c
     }
 }
 
+static const char not_offered[] = "not offered";
+
 static int read_found(struct gphoto *g, struct camera_setting_found *f, CameraWidget **w, char driver[PERSONALITY_NAME], struct camera_event *e)
 {
     char text[sizeof(f->found)];
@@ -700,7 +732,7 @@ static int read_found(struct gphoto *g, struct camera_setting_found *f, CameraWi
     if (got < 0)
         return got;
     f->equal = false;
-    strcpy(f->found, "not offered");
+    strcpy(f->found, not_offered);
     if (got) {
         widget_text(*w, text, sizeof(text));
         f->equal = personality_means(g->personality, f->name, f->wanted, text);
@@ -714,6 +746,9 @@ static int read_found(struct gphoto *g, struct camera_setting_found *f, CameraWi
 int gphoto_configure(struct gphoto *g, const struct camera_command *c, struct camera_event *e)
 {
     bool any_written = false;
+    int64_t began;
+    int code;
+    struct storage ignored;
     int order[CAMERA_SETTINGS_MAX], at[CAMERA_SETTINGS_MAX];
     char driver[PERSONALITY_NAME];
     CameraWidget *w;
@@ -738,8 +773,8 @@ int gphoto_configure(struct gphoto *g, const struct camera_command *c, struct ca
         if (!got)
             continue;
         if (!f->equal && set_widget(g, w, f->name, f->wanted)) {
-            const int64_t began = begin(g);
-            const int code = gp_camera_set_single_config(g->camera, driver, w, g->context);
+            began = begin(g);
+            code = gp_camera_set_single_config(g->camera, driver, w, g->context);
             if (code < 0 && is_fatal(g, code, began)) {
                 gp_widget_unref(w);
                 return failed(g, e, code, began, "cannot change its settings");
@@ -748,6 +783,14 @@ int gphoto_configure(struct gphoto *g, const struct camera_command *c, struct ca
         }
         gp_widget_unref(w);
     }
+    // The driver does not tell a setting that is not there from one that a busy body did not speak of.
+    began = begin(g);
+    code = GP_OK;
+    for (int i = 0; i < e->n_settings && code >= 0; i++)
+        if (!strcmp(e->setting[i].found, not_offered))
+            code = read_storage(g, &ignored);
+    if (code < 0)
+        return failed(g, e, code, began, "cannot read its settings");
     // Read all of them back: one may have moved another. Bodies take a moment to mean what they said.
     for (int k = 0; any_written && k < c->n_settings; k++) {
         struct camera_setting_found *f = &e->setting[k];
@@ -787,6 +830,10 @@ int gphoto_status(struct gphoto *g, struct camera_event *e)
     struct storage storage;
     char text[64];
     *s = (struct camera_status){ -1, -1, -1, -1, NAN, -1, -1, -1, "" };
+    const int64_t began = begin(g);
+    const int code = read_storage(g, &storage); // first: a body that is busy or gone says so here
+    if (code < 0)
+        return failed(g, e, code, began, "cannot ask for its cards");
     int got, i = 0;
     while ((got = ask_body(g, "battery", &i, text, sizeof(text), e)) > 0 && s->battery_percent < 0) {
         const long percent = isdigit((unsigned char)text[0]) ? strtol(text, NULL, 10) : -1;
@@ -819,7 +866,6 @@ int gphoto_status(struct gphoto *g, struct camera_event *e)
         s->objects_per_shot = personality_objects(g->personality, "imageformat", text);
     if (got < 0)
         return got;
-    read_storage(g, &storage);
     s->card_present = storage.n > 0;
     for (int k = 0; k < storage.n; k++) {
         const int64_t bytes = storage.store[k].free_kb == UINT64_MAX ? -1 : (int64_t)(storage.store[k].free_kb * 1024);
@@ -937,7 +983,10 @@ static int dcf_number(const char *folder)
 static int true_view(struct gphoto *g, struct camera_event *e)
 {
     struct storage now;
-    read_storage(g, &now);
+    const int64_t began = begin(g);
+    const int code = read_storage(g, &now);
+    if (code < 0 && is_fatal(g, code, began))
+        return failed(g, e, code, began, "cannot ask for its cards");
     if (!now.n || memcmp(&now, &g->storage, sizeof(now))) {
         disconnect(g);
         close_leftover_links(g);

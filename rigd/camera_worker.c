@@ -249,7 +249,7 @@ static int carry_out(struct worker *w, int64_t deadline_ns)
         return 0;
     }
     if (!gphoto_is_open(w->camera))
-        return gphoto_fail(e, CAMERA_LOST, -ENOTCONN, "it is not open");
+        return gphoto_fail(e, CAMERA_LOST, -ENOTCONN, "it is not connected: it is opened anew");
     switch (c->kind) {
     case CAMERA_CONFIGURE: return gphoto_configure(w->camera, c, e);
     case CAMERA_STATUS: return gphoto_status(w->camera, e);
