@@ -41,8 +41,9 @@ SOLVER := $(addprefix solver/,alternating.c cameras.c cameras_bundler.c cameras_
 KERNELS := $(addprefix solver/kernels/,kernels.c kernels_ref.c kernels_portable.c kernels_avx2.c kernels_avx512.c)
 COMMANDS := $(addprefix solver/commands/,arguments.c brdf.c compare.c export.c inputs.c lights.c output.c render.c report.c solve.c solve_materials.c solved.c synth.c visibility.c)
 LIBRARY := $(TAKE) $(SOLVER) $(KERNELS)
-RIG := $(addprefix rigd/,calibrate.c camera.c config.c digest.c edges.c ledger.c rig.c trigger.c trigger_gpio.c trigger_lines.c trigger_sim.c trigger_software.c)
-RIG_PROGRAMS := # of rigd rigctl rigd-camera: those whose sources are here
+RIG := $(addprefix rigd/,calibrate.c camera.c config.c container.c digest.c edges.c ingest.c ledger.c personality.c rig.c trigger.c \
+  trigger_gpio.c trigger_lines.c trigger_sim.c trigger_software.c)
+RIG_PROGRAMS := rigd-camera # of rigd rigctl rigd-camera: those whose sources are here
 LIBS_RIG = -ljansson -linih -lsystemd -lxxhash -lgpiod -lm
 LIBS_CAMERA = -lgphoto2 -lgphoto2_port -ljansson -lxxhash -lm
 RIGSIM_LIB := $(addprefix tests/rigsim/,body.c dataset.c faults.c frame.c jpeg.c personality.c personality_builtin.c ptp.c ptp_canon.c ptp_datasets.c \
@@ -100,7 +101,7 @@ $(BUILD)/bin/rigd: $(call object,rigd/main.c rigd/daemon.c) $(BUILD)/librig.a $(
 	$(link_rig) $(LIBS_RIG) -o $@
 $(BUILD)/bin/rigctl: $(call object,rigd/rigctl.c) $(BUILD)/librig.a $(BUILD)/libtake.a
 	$(link_rig) $(LIBS_RIG) -o $@
-$(BUILD)/bin/rigd-camera: $(call object,rigd/camera_worker.c rigd/camera_gphoto.c rigd/ingest.c) $(BUILD)/librig.a $(BUILD)/libtake.a
+$(BUILD)/bin/rigd-camera: $(call object,rigd/camera_gphoto.c rigd/camera_worker.c) $(BUILD)/librig.a $(BUILD)/libtake.a
 	$(link_rig) $(LIBS_CAMERA) -o $@
 $(BUILD)/bin/rigsim: $(call object,$(RIGSIM)) $(BUILD)/libstudiorig.a
 	@mkdir -p $(@D)
