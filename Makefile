@@ -55,7 +55,7 @@ FUZZED := $(TAKE) $(addprefix solver/,cameras.c cameras_bundler.c cameras_colmap
 TESTS := $(addprefix test_,alternating brdf cameras cameras_import compare csv disney emitters export gltf_brdf image joint json judge levels \
   lights lm materials mesh misfit normal_equations orientation panorama parallel pcg photometric rays render report rigsim samples shapes stability \
   synth take texels vec3 visibility) check_kernels
-RIG_TESTS := $(addprefix test_,camera config digest rig trigger)
+RIG_TESTS := $(addprefix test_,camera config digest rig studios trigger)
 FUZZERS := cameras cameras_import csv exr hdr json lights mesh
 
 # ---- rules --------------------------------------------------------------------------------------------------------------
@@ -196,6 +196,14 @@ install: $(BUILD)/bin/rigsolve $(MAN)
 	install -D -m 644 -t $(DESTDIR)$(PREFIX)/share/man/man1 $(MAN)
 	install -D -m 644 config/blender/import_studiorig.py $(DESTDIR)$(PREFIX)/share/studiorig/blender/import_studiorig.py
 	install -D -m 644 config/completion/rigsolve.bash $(DESTDIR)$(PREFIX)/share/bash-completion/completions/rigsolve
+	install -D -m 644 config/completion/rigctl.bash $(DESTDIR)$(PREFIX)/share/bash-completion/completions/rigctl
+	install -D -m 644 -t $(DESTDIR)$(PREFIX)/share/studiorig/config config/*.conf
+	install -D -m 644 -t $(DESTDIR)$(PREFIX)/share/studiorig/config/cameras config/cameras/*.conf
+	install -D -m 644 config/systemd/rigd.service $(DESTDIR)$(PREFIX)/lib/systemd/system/rigd.service
+	sed -i 's|/usr/local/bin|$(PREFIX)/bin|' $(DESTDIR)$(PREFIX)/lib/systemd/system/rigd.service
+	install -D -m 644 config/systemd/71-rigd.rules $(DESTDIR)$(PREFIX)/lib/udev/rules.d/71-rigd.rules
+	install -D -m 644 config/systemd/rigd.sysusers $(DESTDIR)$(PREFIX)/lib/sysusers.d/rigd.conf
+	install -D -m 644 config/systemd/rigd.tmpfiles $(DESTDIR)$(PREFIX)/lib/tmpfiles.d/rigd.conf
 	install -D -m 644 -t $(DESTDIR)$(PREFIX)/share/doc/studiorig README.md LICENSE solver/NOTATION.md
 clean:
 	rm -rf build
