@@ -11,7 +11,7 @@ BUILD := build$(if $(filter-out release,$(VARIANT)),/$(VARIANT))
 MACHINE := $(shell uname -m)
 
 # ---- packages (Debian 12; the same names in Debian 13) ----------------------------------------------------------------
-PACKAGES := gcc make pkg-config libopenexr-dev libembree-dev libassimp-dev libjansson-dev libtiff-dev libpng-dev libjpeg-dev libexpat1-dev liblapacke-dev libopenblas-dev libcmocka-dev perl help2man
+PACKAGES := gcc make pkg-config libopenexr-dev libembree-dev libassimp-dev libjansson-dev libtiff-dev libpng-dev libjpeg-dev libexpat1-dev liblapacke-dev libopenblas-dev libcmocka-dev perl help2man libgphoto2-dev libgpiod-dev libinih-dev libsystemd-dev libxxhash-dev
 PACKAGES_FUZZ := clang libclang-rt-dev
 PACKAGES_BENCH := libceres-dev g++ gnuplot-nox
 
@@ -40,17 +40,20 @@ SOLVER := $(addprefix solver/,alternating.c cameras.c cameras_bundler.c cameras_
 KERNELS := $(addprefix solver/kernels/,kernels.c kernels_ref.c kernels_portable.c kernels_avx2.c kernels_avx512.c)
 COMMANDS := $(addprefix solver/commands/,arguments.c brdf.c compare.c export.c inputs.c lights.c output.c render.c report.c solve.c solve_materials.c solved.c synth.c visibility.c)
 LIBRARY := $(TAKE) $(SOLVER) $(KERNELS)
-RIG := $(addprefix rigd/,calibrate.c camera.c config.c control.c describe.c digest.c doctor.c edges.c ledger.c manifest.c rig.c trigger.c trigger_gpio.c trigger_lines.c trigger_sim.c trigger_software.c)
-RIG_PROGRAMS := rigctl rigd
+RIG := $(addprefix rigd/,calibrate.c camera.c config.c container.c control.c describe.c digest.c doctor.c edges.c ingest.c ledger.c manifest.c personality.c rig.c trigger.c trigger_gpio.c trigger_lines.c trigger_sim.c trigger_software.c)
+RIG_PROGRAMS := rigctl rigd rigd-camera
 LIBS_RIG = -ljansson -linih -lsystemd -lxxhash -lgpiod -lm
 LIBS_CAMERA = -lgphoto2 -lgphoto2_port -ljansson -lxxhash -lm
+RIGSIM_LIB := $(addprefix tests/rigsim/,body.c dataset.c faults.c frame.c jpeg.c personality.c personality_builtin.c ptp.c ptp_canon.c ptp_datasets.c \
+  ptp_nikon.c ptpip.c raw_dng.c scene.c)
+RIGSIM := $(RIGSIM_LIB) $(addprefix tests/rigsim/,main.c server.c server_faults.c server_shutter.c)
 FUZZED := $(TAKE) $(addprefix solver/,cameras.c cameras_bundler.c cameras_colmap.c cameras_format.c cameras_meshroom.c \
   cameras_metashape.c cameras_realitycapture.c csv.c lights.c mesh.c mesh_gltf_floats.c mesh_import.c orientation.c panorama.c parallel.c \
   picture_size.c texels.c xml.c)
 TESTS := $(addprefix test_,alternating brdf cameras cameras_import compare csv disney emitters export gltf_brdf image joint json judge levels \
-  lights lm materials mesh misfit normal_equations orientation panorama parallel pcg photometric rays render report samples shapes stability \
+  lights lm materials mesh misfit normal_equations orientation panorama parallel pcg photometric rays render report rigsim samples shapes stability \
   synth take texels vec3 visibility) check_kernels
-RIG_TESTS := $(addprefix test_,camera config control digest manifest rig trigger)
+RIG_TESTS := $(addprefix test_,camera config control digest manifest rig studios trigger)
 FUZZERS := cameras cameras_import csv exr hdr json lights mesh
 
 # ---- rules --------------------------------------------------------------------------------------------------------------
@@ -62,7 +65,7 @@ endif
 .DELETE_ON_ERROR:
 .SECONDARY:
 
-all: $(BUILD)/bin/rigsolve $(addprefix $(BUILD)/bin/,$(RIG_PROGRAMS))
+all: $(BUILD)/bin/rigsim $(BUILD)/bin/rigsolve $(addprefix $(BUILD)/bin/,$(RIG_PROGRAMS))
 
 $(BUILD)/obj/%.o: %.c Makefile | $(FIRST)
 	@mkdir -p $(@D)
@@ -96,14 +99,19 @@ $(BUILD)/bin/rigd: $(call object,rigd/main.c rigd/daemon.c) $(BUILD)/librig.a $(
 	$(link_rig) $(LIBS_RIG) -o $@
 $(BUILD)/bin/rigctl: $(call object,rigd/rigctl.c) $(BUILD)/librig.a $(BUILD)/libtake.a
 	$(link_rig) $(LIBS_RIG) -o $@
-$(BUILD)/bin/rigd-camera: $(call object,rigd/camera_worker.c rigd/camera_gphoto.c rigd/ingest.c) $(BUILD)/librig.a $(BUILD)/libtake.a
+$(BUILD)/bin/rigd-camera: $(call object,rigd/camera_gphoto.c rigd/camera_worker.c) $(BUILD)/librig.a $(BUILD)/libtake.a
 	$(link_rig) $(LIBS_CAMERA) -o $@
+$(BUILD)/bin/rigsim: $(call object,$(RIGSIM)) $(BUILD)/libstudiorig.a
+	@mkdir -p $(@D)
+	@$(if $(V),,echo '  LD $@')
+	$(Q)$(CC) $(CFLAGS_ALL) $^ $(LIBS) -o $@
 $(BUILD)/tests/%: $(BUILD)/obj/tests/%.o $(BUILD)/libstudiorig.a
 	@mkdir -p $(@D)
 	@$(if $(V),,echo '  LD $@')
 	$(Q)$(CC) $(CFLAGS_ALL) $^ -lcmocka $(LIBS) -o $@
 $(addprefix $(BUILD)/tests/,$(RIG_TESTS)): $(BUILD)/tests/%: $(BUILD)/obj/tests/%.o $(BUILD)/librig.a $(BUILD)/libtake.a
 	$(link_rig) -lcmocka $(LIBS_RIG) -o $@
+$(BUILD)/tests/test_rigsim $(BUILD)/tests/test_rigsim_wire: $(call object,$(RIGSIM_LIB))
 $(BUILD)/tests/bench/stability_joint: $(call object,solver/commands/arguments.c)
 $(BUILD)/tests/test_pcg: LIBS += $(if $(wildcard /usr/include/suitesparse/cholmod.h),-lcholmod)
 $(BUILD)/fuzz/obj/%.o: %.c Makefile | deps-fuzz
@@ -186,6 +194,14 @@ install: $(BUILD)/bin/rigsolve $(MAN)
 	install -D -m 644 -t $(DESTDIR)$(PREFIX)/share/man/man1 $(MAN)
 	install -D -m 644 config/blender/import_studiorig.py $(DESTDIR)$(PREFIX)/share/studiorig/blender/import_studiorig.py
 	install -D -m 644 config/completion/rigsolve.bash $(DESTDIR)$(PREFIX)/share/bash-completion/completions/rigsolve
+	install -D -m 644 config/completion/rigctl.bash $(DESTDIR)$(PREFIX)/share/bash-completion/completions/rigctl
+	install -D -m 644 -t $(DESTDIR)$(PREFIX)/share/studiorig/config config/*.conf
+	install -D -m 644 -t $(DESTDIR)$(PREFIX)/share/studiorig/config/cameras config/cameras/*.conf
+	install -D -m 644 config/systemd/rigd.service $(DESTDIR)$(PREFIX)/lib/systemd/system/rigd.service
+	sed -i 's|/usr/local/bin|$(PREFIX)/bin|' $(DESTDIR)$(PREFIX)/lib/systemd/system/rigd.service
+	install -D -m 644 config/systemd/71-rigd.rules $(DESTDIR)$(PREFIX)/lib/udev/rules.d/71-rigd.rules
+	install -D -m 644 config/systemd/rigd.sysusers $(DESTDIR)$(PREFIX)/lib/sysusers.d/rigd.conf
+	install -D -m 644 config/systemd/rigd.tmpfiles $(DESTDIR)$(PREFIX)/lib/tmpfiles.d/rigd.conf
 	install -D -m 644 -t $(DESTDIR)$(PREFIX)/share/doc/studiorig README.md LICENSE solver/NOTATION.md
 clean:
 	rm -rf build

@@ -32,7 +32,7 @@ static void add_wires(struct edges *e, enum edges_role role, bool of_cameras)
     const int common = common_line == CONFIG_NONE ? CONFIG_NONE : add_wire(e, role, common_line, NULL, key);
     for (int i = 0; i < c->n_cameras; i++) {
         const int own = role == EDGES_FULL ? c->camera[i].full_line : c->camera[i].half_line;
-        const int line = of_cameras ? 2 * i + (role == EDGES_HALF) : own;
+        const int line = of_cameras ? EDGES_LINE_OF(i, role) : own;
         wire_of[i] = line == CONFIG_NONE ? common : add_wire(e, role, line, c->camera[i].name, key);
     }
 }
@@ -46,7 +46,7 @@ int edges_init(struct edges *e, const struct config *config, bool of_cameras, _A
     add_wires(e, EDGES_FULL, of_cameras);
     add_wires(e, EDGES_HALF, of_cameras);
     for (int i = 0; i < config->n_cameras; i++) {
-        const int line = of_cameras ? CONFIG_NONE : config->camera[i].relay_line;
+        const int line = of_cameras ? EDGES_LINE_OF(i, EDGES_RELAY) : config->camera[i].relay_line;
         e->relay_of[i] = line == CONFIG_NONE ? CONFIG_NONE : add_wire(e, EDGES_RELAY, line, config->camera[i].name, "relay_line");
         if (e->full_of[i] == CONFIG_NONE) {
             log_error("trigger: camera %s has no full_line and [trigger] has none for all: give it one, or use kind = software",

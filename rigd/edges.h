@@ -11,7 +11,8 @@ enum { EDGES_WIRES_MAX = 3 * CONFIG_CAMERAS_MAX + 2 };
 #define EDGES_NEVER INT64_MAX
 #define EDGES_LATE_MAX_NS INT64_C(250000000) // a press later than this is not done at all: the picture would be a surprise
 
-enum edges_role { EDGES_FULL, EDGES_HALF, EDGES_RELAY };
+enum edges_role { EDGES_FULL, EDGES_HALF, EDGES_RELAY, EDGES_N_ROLES };
+#define EDGES_LINE_OF(camera, role) ((camera) * EDGES_N_ROLES + (int)(role)) // in the simulated rig
 
 struct edges_wire {
     enum edges_role role;
@@ -44,7 +45,7 @@ struct edges_step {
     bool too_late;     // a press was due longer than EDGES_LATE_MAX_NS ago: the shot is given up, everything is inactive
 };
 
-// Lines of config; of_cameras: the simulated rig, where each camera has lines of its own (2 i full, 2 i + 1 half). limit_ns: at least
+// Lines of config; of_cameras: the simulated rig, where each camera has lines of its own (EDGES_LINE_OF). limit_ns: at least
 // EDGES_WIRES_MAX, zeroed, kept. 0, or -EINVAL: a camera has no line to press (logged).
 int edges_init(struct edges *e, const struct config *config, bool of_cameras, _Atomic int64_t *limit_ns);
 unsigned edges_abilities(const struct edges *e); // of TRIGGER_...: half-press, delays, relays

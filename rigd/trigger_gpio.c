@@ -316,7 +316,7 @@ static int open_chip(struct gpio *g, const char *wanted)
     if (err == -ENOENT)
         err = -ENODEV;
     if (err == -EACCES)
-        log_error("trigger: gpio chip %s: permission denied: let rigd's user into group gpio (config/99-rigd.rules)", wanted);
+        log_error("trigger: gpio chip %s: permission denied: let rigd's user into group gpio (config/systemd/71-rigd.rules)", wanted);
     else if (err)
         log_error("trigger: no gpio chip \"%s\" (%s); there are:%s: see gpiodetect and set chip in [trigger]", wanted, strerror(-err),
             seen[0] ? seen : " look in /dev");

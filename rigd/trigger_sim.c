@@ -16,7 +16,7 @@
 
 struct simulated {
     int fd, n_outputs, n_inputs;
-    int line[EDGES_WIRES_MAX];      // of each output: 2 x camera full, 2 x camera + 1 half
+    int line[EDGES_WIRES_MAX]; // of each output: EDGES_LINE_OF(camera, role)
     uint64_t was_active[LINES_WORDS];
     char address[108];
 };
@@ -69,6 +69,8 @@ static int send_records(struct simulated *s, const struct shutter_line *record, 
 
 static int simulated_set(void *self, const uint64_t *active, const uint64_t *changed, int64_t at_ns)
 {
+    static const uint8_t name_of[] = { [EDGES_FULL] = SHUTTER_LINE_FULL, [EDGES_HALF] = SHUTTER_LINE_HALF,
+        [EDGES_RELAY] = SHUTTER_LINE_POWER };
     struct simulated *s = self;
     struct shutter_line record[SHUTTER_LINE_PER_PACKET];
     int n = 0, err = 0;
@@ -76,8 +78,8 @@ static int simulated_set(void *self, const uint64_t *active, const uint64_t *cha
         const uint64_t bit = UINT64_C(1) << i % 64;
         if (!(changed[i / 64] & (active[i / 64] ^ s->was_active[i / 64]) & bit))
             continue;
-        record[n++] = (struct shutter_line){ .kind = SHUTTER_LINE_SET, .line = s->line[i] % 2 ? SHUTTER_LINE_HALF : SHUTTER_LINE_FULL,
-            .level = (active[i / 64] & bit) != 0, .channel = (uint32_t)s->line[i] / 2, .at_ns = at_ns };
+        record[n++] = (struct shutter_line){ .kind = SHUTTER_LINE_SET, .line = name_of[s->line[i] % EDGES_N_ROLES],
+            .level = (active[i / 64] & bit) != 0, .channel = (uint32_t)s->line[i] / EDGES_N_ROLES, .at_ns = at_ns };
         s->was_active[i / 64] ^= bit;
         if (n == SHUTTER_LINE_PER_PACKET) {
             err = send_records(s, record, n);
@@ -132,4 +134,4 @@ static int trigger_simulated_open(void **self, const struct config *config, cons
 }
 
 const struct trigger_ops trigger_simulated = { trigger_simulated_open, trigger_lines_abilities, trigger_lines_fire,
-    trigger_lines_release, NULL, trigger_lines_fd, trigger_lines_dispatch, trigger_lines_close };
+    trigger_lines_release, trigger_lines_relay, trigger_lines_fd, trigger_lines_dispatch, trigger_lines_close };

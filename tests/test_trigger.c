@@ -779,9 +779,16 @@ static void the_simulated_rig_gets_exact_times_and_answers(void **state)
     assert_int_equal(bind(listening, (struct sockaddr *)&a, length), 0);
     assert_int_equal(listen(listening, 1), 0);
     assert_int_equal(trigger_open(&t, &config, &host), 0);
-    assert_int_equal(trigger_abilities(t), TRIGGER_SYNCHRONISED | TRIGGER_HALF_PRESS | TRIGGER_DELAYS | TRIGGER_FEEDBACK);
-    assert_int_equal(trigger_relay(t, 0, true), -ENOTSUP);
+    assert_int_equal(trigger_abilities(t), TRIGGER_SYNCHRONISED | TRIGGER_HALF_PRESS | TRIGGER_DELAYS | TRIGGER_FEEDBACK |
+        TRIGGER_RELAYS);
     const int rigsim = accept(listening, NULL, NULL);
+    for (int cut = 1; cut >= 0; cut--) {
+        assert_int_equal(trigger_relay(t, 150, cut), 0);
+        assert_int_equal(receive(rigsim, record), 1);
+        assert_int_equal(record[0].line, SHUTTER_LINE_POWER);
+        assert_int_equal(record[0].level, cut);
+        assert_int_equal(record[0].channel, 150);
+    }
 
     uint32_t delay_us[200] = { [7] = 1234 };
     const struct trigger_shot shot = { .at_ns = clock_ns() + 200 * MS, .half_ms = 150, .hold_ms = 10, .delay_us = delay_us };

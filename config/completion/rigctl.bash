@@ -1,0 +1,31 @@
+# bash completion for rigctl: its commands, then what the daemon knows: cameras, takes. A daemon that does not answer completes nothing.
+_rigctl_ask() { # command, key: the values of that key in its JSON
+    local socket=() i
+    for ((i = 1; i < ${#COMP_WORDS[@]}; i++)); do
+        [[ ${COMP_WORDS[i]} == --socket ]] && socket=(--socket "${COMP_WORDS[i + 1]}")
+    done
+    timeout 1 rigctl "${socket[@]}" --json "$1" 2>/dev/null | grep -oE "\"$2\": *\"[^\"]*\"" | sed 's/.*"\([^"]*\)"$/\1/'
+}
+_rigctl() {
+    local cur=${COMP_WORDS[COMP_CWORD]} before=${COMP_WORDS[COMP_CWORD - 1]} command='' i
+    COMPREPLY=()
+    [[ $before == --socket || $before == --name ]] && return
+    for ((i = 1; i < COMP_CWORD; i++)); do
+        case ${COMP_WORDS[i]} in
+        --socket) ((i++)) ;;
+        -*) ;;
+        *) command=${COMP_WORDS[i]} && break ;;
+        esac
+    done
+    case $command in
+    '') mapfile -t COMPREPLY < <(compgen -W "status doctor preflight capture panorama preview report calibrate identify reinstate cancel takes resume export \
+        develop --socket --json --help --version" -- "$cur") ;;
+    calibrate) mapfile -t COMPREPLY < <(compgen -W "lag colour" -- "$cur") ;;
+    identify | reinstate) mapfile -t COMPREPLY < <(compgen -W "$(_rigctl_ask status name)" -- "$cur") ;;
+    preview | report | resume | export) mapfile -t COMPREPLY < <(compgen -W "$(_rigctl_ask takes id)" -- "$cur") ;;
+    status) mapfile -t COMPREPLY < <(compgen -W "--watch" -- "$cur") ;;
+    capture) mapfile -t COMPREPLY < <(compgen -W "--name --without-missing" -- "$cur") ;;
+    develop) [[ $cur == -* ]] && mapfile -t COMPREPLY < <(compgen -W "-o --tiff --half" -- "$cur") ;;
+    esac
+}
+complete -o default -F _rigctl rigctl
