@@ -47,7 +47,7 @@ FUZZED := $(TAKE) $(addprefix solver/,cameras.c cameras_bundler.c cameras_colmap
   cameras_metashape.c cameras_realitycapture.c csv.c lights.c mesh.c mesh_gltf_floats.c mesh_import.c orientation.c panorama.c parallel.c \
   picture_size.c texels.c xml.c)
 TESTS := $(addprefix test_,alternating brdf cameras cameras_import compare csv disney emitters export gltf_brdf image joint json judge levels \
-  lights lm materials mesh misfit normal_equations orientation panorama parallel pcg photometric rays render report rigsim samples shapes stability \
+  lights lm materials mesh misfit normal_equations orientation panorama parallel pcg photometric rays render report rigsim rigsim_wire samples shapes stability \
   synth take texels vec3 visibility) check_kernels
 FUZZERS := cameras cameras_import csv exr hdr json lights mesh
 
@@ -89,7 +89,9 @@ $(BUILD)/tests/%: $(BUILD)/obj/tests/%.o $(BUILD)/libstudiorig.a
 	@mkdir -p $(@D)
 	@$(if $(V),,echo '  LD $@')
 	$(Q)$(CC) $(CFLAGS_ALL) $^ -lcmocka $(LIBS) -o $@
-$(BUILD)/tests/test_rigsim $(BUILD)/tests/test_rigsim_wire: $(call object,$(RIGSIM_LIB))
+$(BUILD)/tests/test_rigsim: $(call object,$(RIGSIM_LIB))
+$(BUILD)/tests/test_rigsim: LIBS := $(BUILD)/libstudiorig.a $(LIBS)
+$(BUILD)/tests/test_rigsim_wire: $(call object,$(addprefix tests/rigsim/,client.c dataset.c ptpip.c)) | $(BUILD)/bin/rigsim
 $(BUILD)/tests/bench/stability_joint: $(call object,solver/commands/arguments.c)
 $(BUILD)/tests/test_pcg: LIBS += $(if $(wildcard /usr/include/suitesparse/cholmod.h),-lcholmod)
 $(BUILD)/fuzz/obj/%.o: %.c Makefile | deps-fuzz
