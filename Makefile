@@ -51,7 +51,7 @@ FUZZED := $(TAKE) $(addprefix solver/,cameras.c cameras_bundler.c cameras_colmap
   cameras_metashape.c cameras_realitycapture.c csv.c lights.c mesh.c mesh_gltf_floats.c mesh_import.c orientation.c panorama.c parallel.c \
   picture_size.c texels.c xml.c)
 TESTS := $(addprefix test_,alternating brdf cameras cameras_import compare csv disney emitters export gltf_brdf image joint json judge levels \
-  lights lm materials mesh misfit normal_equations orientation panorama parallel pcg photometric rays render report rigsim samples shapes stability \
+  lights lm materials mesh misfit normal_equations orientation panorama parallel pcg photometric rays render report rigsim rigsim_wire samples shapes stability \
   synth take texels vec3 visibility) check_kernels
 RIG_TESTS := $(addprefix test_,camera camera_worker config container control digest ingest manifest personality rig studios trigger)
 FUZZERS := cameras cameras_import csv exr hdr json lights mesh
@@ -112,6 +112,9 @@ $(BUILD)/tests/%: $(BUILD)/obj/tests/%.o $(BUILD)/libstudiorig.a
 $(addprefix $(BUILD)/tests/,$(RIG_TESTS)): $(BUILD)/tests/%: $(BUILD)/obj/tests/%.o $(BUILD)/librig.a $(BUILD)/libtake.a
 	$(link_rig) -lcmocka $(LIBS_RIG) -o $@
 $(BUILD)/tests/test_rigsim $(BUILD)/tests/test_rigsim_wire: $(call object,$(RIGSIM_LIB))
+$(BUILD)/tests/test_rigsim: $(call object,$(RIGSIM_LIB))
+$(BUILD)/tests/test_rigsim: LIBS := $(BUILD)/libstudiorig.a $(LIBS)
+$(BUILD)/tests/test_rigsim_wire: $(call object,$(addprefix tests/rigsim/,client.c dataset.c ptpip.c)) | $(BUILD)/bin/rigsim
 $(BUILD)/tests/bench/stability_joint: $(call object,solver/commands/arguments.c)
 $(BUILD)/tests/test_pcg: LIBS += $(if $(wildcard /usr/include/suitesparse/cholmod.h),-lcholmod)
 $(BUILD)/fuzz/obj/%.o: %.c Makefile | deps-fuzz
