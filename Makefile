@@ -11,7 +11,7 @@ BUILD := build$(if $(filter-out release,$(VARIANT)),/$(VARIANT))
 MACHINE := $(shell uname -m)
 
 # ---- packages (Debian 12; the same names in Debian 13) ----------------------------------------------------------------
-PACKAGES := gcc make pkg-config libopenexr-dev libembree-dev libassimp-dev libjansson-dev libtiff-dev libpng-dev libexpat1-dev liblapacke-dev libopenblas-dev libcmocka-dev perl help2man \
+PACKAGES := gcc make pkg-config libopenexr-dev libembree-dev libassimp-dev libjansson-dev libtiff-dev libjpeg-dev libpng-dev libexpat1-dev liblapacke-dev libopenblas-dev libcmocka-dev perl help2man \
   libgphoto2-dev libgpiod-dev libinih-dev libsystemd-dev libxxhash-dev
 PACKAGES_FUZZ := clang libclang-rt-dev
 PACKAGES_BENCH := libceres-dev g++ gnuplot-nox
@@ -25,14 +25,14 @@ CFLAGS_ALL = -std=gnu11 -D_GNU_SOURCE $(FLAGS_$(VARIANT)) -Wall -Wextra -Wshadow
   -ffp-contract=off -ffile-prefix-map=$(CURDIR)=. -pthread -I. -I/usr/include/OpenEXR -I/usr/include/Imath \
   -DSTUDIORIG_VERSION='"$(VERSION)"' $(CFLAGS)
 EMBREE = $(shell test -e /usr/include/embree4/rtcore.h && echo embree4 || echo embree3)
-LIBS = -lOpenEXRCore -l$(EMBREE) -lassimp -ljansson -ltiff -lpng -lexpat -llapacke -lopenblas -lm
+LIBS = -lOpenEXRCore -l$(EMBREE) -lassimp -ljansson -ltiff -lpng -ljpeg -lexpat -llapacke -lopenblas -lm
 ifeq ($(MACHINE),x86_64)
 ISA_avx2 := -mavx2 -mfma -ffp-contract=fast
 ISA_avx512 := -mavx512f -mavx512dq -mavx512bw -mavx512vl -mfma -mprefer-vector-width=512 -ffp-contract=fast
 endif
 
 # ---- what is built ------------------------------------------------------------------------------------------------------
-TAKE := $(addprefix solver/take/,atomic_file.c image.c image_exr.c image_hdr.c image_png.c image_tiff.c json.c log.c progress.c take.c)
+TAKE := $(addprefix solver/take/,atomic_file.c image.c image_exr.c image_hdr.c image_jpeg.c image_png.c image_tiff.c json.c log.c progress.c take.c)
 SOLVER := $(addprefix solver/,alternating.c cameras.c cameras_bundler.c cameras_colmap.c cameras_format.c cameras_frame.c \
   cameras_meshroom.c cameras_metashape.c cameras_realitycapture.c compare.c csv.c disney.c emitters.c export.c export_glb.c \
   export_materialx.c export_obj.c gltf_brdf.c interreflection.c joint.c levels.c lights.c lm.c materials.c mesh.c mesh_gltf_floats.c mesh_import.c misfit.c normal_equations.c \
@@ -41,29 +41,33 @@ SOLVER := $(addprefix solver/,alternating.c cameras.c cameras_bundler.c cameras_
 KERNELS := $(addprefix solver/kernels/,kernels.c kernels_ref.c kernels_portable.c kernels_avx2.c kernels_avx512.c)
 COMMANDS := $(addprefix solver/commands/,arguments.c brdf.c compare.c export.c inputs.c lights.c output.c render.c report.c solve.c solve_materials.c solved.c synth.c visibility.c)
 LIBRARY := $(TAKE) $(SOLVER) $(KERNELS)
-RIG := $(addprefix rigd/,calibrate.c camera.c config.c control.c describe.c digest.c doctor.c edges.c ledger.c manifest.c rig.c trigger.c trigger_gpio.c trigger_lines.c trigger_sim.c trigger_software.c)
-RIG_PROGRAMS := rigctl rigd
+RIG := $(addprefix rigd/,calibrate.c camera.c config.c container.c control.c describe.c digest.c doctor.c edges.c ingest.c ledger.c manifest.c personality.c rig.c trigger.c \
+  trigger_gpio.c trigger_lines.c trigger_sim.c trigger_software.c)
+RIG_PROGRAMS := rigctl rigd rigd-camera
 LIBS_RIG = -ljansson -linih -lsystemd -lxxhash -lgpiod -lm
 LIBS_CAMERA = -lgphoto2 -lgphoto2_port -ljansson -lxxhash -lm
+RIGSIM_LIB := $(addprefix tests/rigsim/,body.c dataset.c faults.c frame.c jpeg.c personality.c personality_builtin.c ptp.c ptp_canon.c ptp_datasets.c \
+  ptp_nikon.c ptpip.c raw_dng.c scene.c)
+RIGSIM := $(RIGSIM_LIB) $(addprefix tests/rigsim/,main.c server.c server_faults.c server_shutter.c)
 FUZZED := $(TAKE) $(addprefix solver/,cameras.c cameras_bundler.c cameras_colmap.c cameras_format.c cameras_meshroom.c \
   cameras_metashape.c cameras_realitycapture.c csv.c lights.c mesh.c mesh_gltf_floats.c mesh_import.c orientation.c panorama.c parallel.c \
   picture_size.c texels.c xml.c)
 TESTS := $(addprefix test_,alternating brdf cameras cameras_import compare csv disney emitters export gltf_brdf image joint json judge levels \
-  lights lm materials mesh misfit normal_equations orientation panorama parallel pcg photometric rays render report samples shapes stability \
+  lights lm materials mesh misfit normal_equations orientation panorama parallel pcg photometric rays render report rigsim samples shapes stability \
   synth take texels vec3 visibility) check_kernels
-RIG_TESTS := $(addprefix test_,camera config control digest manifest rig trigger)
+RIG_TESTS := $(addprefix test_,camera camera_worker config container control digest ingest manifest personality rig trigger)
 FUZZERS := cameras cameras_import csv exr hdr json lights mesh
 
 # ---- rules --------------------------------------------------------------------------------------------------------------
 object = $(patsubst %.c,$(BUILD)/obj/%.o,$(1))
-ifneq ($(filter test test-vm demo bench chart figure5 stability experiments,$(MAKECMDGOALS)),)
+ifneq ($(filter test test-vm demo bench chart figure5 figures stability experiments,$(MAKECMDGOALS)),)
 FIRST := deps # these install what is missing before the first file is compiled
 endif
-.PHONY: all deps deps-fuzz deps-bench test test-vm demo bench chart figure5 stability experiments fuzz check-includes man install clean help
+.PHONY: all deps deps-fuzz deps-bench test test-vm demo bench chart figure5 figures stability experiments fuzz check-includes man install clean help
 .DELETE_ON_ERROR:
 .SECONDARY:
 
-all: $(BUILD)/bin/rigsolve $(addprefix $(BUILD)/bin/,$(RIG_PROGRAMS))
+all: $(BUILD)/bin/rigsim $(BUILD)/bin/rigsolve $(addprefix $(BUILD)/bin/,$(RIG_PROGRAMS))
 
 $(BUILD)/obj/%.o: %.c Makefile | $(FIRST)
 	@mkdir -p $(@D)
@@ -97,14 +101,19 @@ $(BUILD)/bin/rigd: $(call object,rigd/main.c rigd/daemon.c) $(BUILD)/librig.a $(
 	$(link_rig) $(LIBS_RIG) -o $@
 $(BUILD)/bin/rigctl: $(call object,rigd/rigctl.c) $(BUILD)/librig.a $(BUILD)/libtake.a
 	$(link_rig) $(LIBS_RIG) -o $@
-$(BUILD)/bin/rigd-camera: $(call object,rigd/camera_worker.c rigd/camera_gphoto.c rigd/ingest.c) $(BUILD)/librig.a $(BUILD)/libtake.a
+$(BUILD)/bin/rigd-camera: $(call object,rigd/camera_gphoto.c rigd/camera_worker.c) $(BUILD)/librig.a $(BUILD)/libtake.a
 	$(link_rig) $(LIBS_CAMERA) -o $@
+$(BUILD)/bin/rigsim: $(call object,$(RIGSIM)) $(BUILD)/libstudiorig.a
+	@mkdir -p $(@D)
+	@$(if $(V),,echo '  LD $@')
+	$(Q)$(CC) $(CFLAGS_ALL) $^ $(LIBS) -o $@
 $(BUILD)/tests/%: $(BUILD)/obj/tests/%.o $(BUILD)/libstudiorig.a
 	@mkdir -p $(@D)
 	@$(if $(V),,echo '  LD $@')
 	$(Q)$(CC) $(CFLAGS_ALL) $^ -lcmocka $(LIBS) -o $@
 $(addprefix $(BUILD)/tests/,$(RIG_TESTS)): $(BUILD)/tests/%: $(BUILD)/obj/tests/%.o $(BUILD)/librig.a $(BUILD)/libtake.a
 	$(link_rig) -lcmocka $(LIBS_RIG) -o $@
+$(BUILD)/tests/test_rigsim $(BUILD)/tests/test_rigsim_wire: $(call object,$(RIGSIM_LIB))
 $(BUILD)/tests/bench/stability_joint: $(call object,solver/commands/arguments.c)
 $(BUILD)/tests/test_pcg: LIBS += $(if $(wildcard /usr/include/suitesparse/cholmod.h),-lcholmod)
 $(BUILD)/fuzz/obj/%.o: %.c Makefile | deps-fuzz
@@ -163,6 +172,9 @@ chart: deps deps-bench $(BUILD)/tests/bench/chart_lights
 figure5: deps deps-bench $(BUILD)/tests/bench/figure5
 	@mkdir -p build/figure5 && $(BUILD)/tests/bench/figure5 build/figure5 >build/figure5/figure5.csv && gnuplot -e "out='build/figure5/figure5'" tests/bench/figure5.gp
 	@echo "figure5: build/figure5/figure5.csv .svg .png: the paper's Figure 5: w_sim x start x true lights"
+figures: deps deps-bench $(BUILD)/bin/rigsolve
+	@BIN=$(BUILD)/bin sh tests/bench/figures_materials.sh
+	@echo "figures: build/figures_materials/*.csv, *.svg: the paper's Figures 8 to 11"
 STABILITY_OPTIONS ?=
 stability: deps deps-bench $(BUILD)/tests/bench/stability_kernels $(BUILD)/tests/bench/stability_joint
 	@mkdir -p build/stability && $(BUILD)/tests/bench/stability_kernels >build/stability/kernels.csv && gnuplot -e "out='build/stability/kernels'" tests/bench/stability_kernels.gp

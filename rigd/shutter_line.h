@@ -6,7 +6,7 @@
 // both ends are on one machine. Times are CLOCK_MONOTONIC nanoseconds.
 //
 // To rigsim - a change of a line:
-//   kind = SHUTTER_LINE_SET, line = half or full press, level = 1 (contact closed: pressed) or 0, channel = camera's index
+//   kind = SHUTTER_LINE_SET, line = half press, full press or power, level = 1 (contact closed: pressed) or 0, channel = camera's index
 //   (0 = first, as --list prints them) or SHUTTER_LINE_ALL, at_ns = when the contact changes. at_ns may lie in the past (0:
 //   now; the change then happens at once, but shutter lag counts from at_ns, so that a late process does not shift the
 //   exposure) and up to 60 s in the future. Changes of one line must come in the order of their times. tag: any number; it
@@ -19,7 +19,9 @@
 //   kind = SHUTTER_LINE_REFUSED: to the sender only: that record was not done; `error` is an errno value: EINVAL (kind, line
 //   or level unknown, or a packet of another size), ENODEV (no such channel), ETIME (more than 60 s ahead), ENOSPC (over 64
 //   changes waiting on one channel), ENXIO (the body has no power).
-// When the last client leaves, every line opens: a dead host never leaves a shutter pressed.
+// The relay of a camera's supply is a line, too: SHUTTER_LINE_POWER, level 1 = cut (the body is off, its links break; its card
+// survives), 0 = given (it boots for a second, settings as before).
+// When the last client leaves, every line opens and every supply is given: a dead host never leaves a shutter pressed.
 //
 // Half-press: with a body whose personality says half_press_blocks_usb = yes (most do) its PTP connection does not answer
 // while half-press or full-press is closed. Full-press alone works, too, with the same lag; a body that slept (2 s without
@@ -32,7 +34,7 @@ enum { SHUTTER_LINE_PER_PACKET = 512, SHUTTER_LINE_PENDING_MAX = 64 };
 #define SHUTTER_LINE_HORIZON_NS INT64_C(60000000000)
 
 enum shutter_line_kind { SHUTTER_LINE_SET = 1, SHUTTER_LINE_SYNC = 2, SHUTTER_LINE_REFUSED = 3 };
-enum shutter_line_name { SHUTTER_LINE_HALF = 1, SHUTTER_LINE_FULL = 2 };
+enum shutter_line_name { SHUTTER_LINE_HALF = 1, SHUTTER_LINE_FULL = 2, SHUTTER_LINE_POWER = 3 };
 
 struct shutter_line {
     uint16_t kind;    // enum shutter_line_kind

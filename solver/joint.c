@@ -383,20 +383,19 @@ static void doubt(const struct stage1 *s, struct joint_result *out, int n_fit_vi
 }
 
 int joint_solve(struct joint_result *out, const struct texels *texels, const struct samples *samples,
-                const struct rays *rays, const struct lights *lights, int n_groups, const uint8_t *hold_out,
-                const struct joint_settings *set)
+                const struct rays *rays, const struct lights *lights, const uint8_t *hold_out, const struct joint_settings *set)
 {
     struct stage1 s = { 0 };
     int32_t *group_of_light = malloc((size_t)lights->n * sizeof(*group_of_light));
+    const int n_groups = group_of_light ? lights_number_distances(lights, group_of_light) : 0;
     struct photometric p = { .texels = texels, .samples = samples, .model = set->model, .variant = set->variant, .albedo = set->albedo,
                              .group_of_light = group_of_light, .n_groups = n_groups, .texel_step = 1, .n_threads = set->n_threads };
     memset(out, 0, sizeof(*out));
+    out->n_distances = n_groups;
     uint8_t *fit = calloc((size_t)samples->n_views + 1, 1), *held = calloc((size_t)samples->n_views + 1, 1);
     int64_t *per_view = calloc((size_t)samples->n_views + 1, sizeof(*per_view));
     out->inverse_distance_std = calloc((size_t)n_groups, sizeof(double));
     int err = fit && held && per_view && group_of_light && out->inverse_distance_std ? 0 : -ENOMEM, n_fit_views = 0, n_held = 0;
-    for (int i = 0; !err && i < lights->n; i++)
-        group_of_light[i] = lights->group[i] >= 0 ? lights->group[i] : i / (lights->n / n_groups);
     for (int64_t i = 0; !err && i < samples->n; i++)
         per_view[samples->view[i]]++;
     for (int v = 0; !err && v < samples->n_views; v++) {

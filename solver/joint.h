@@ -51,7 +51,8 @@ struct joint_result {
     const char *stop_reason;
     // Standard deviations (misfit_deviations); infinite where nothing depends on an unknown.
     double theta_std[DISNEY_N], centre_std_m[3], rotation_std_rad[3];
-    double *inverse_distance_std;    // [groups] 1/m; owned
+    int n_distances;
+    double *inverse_distance_std;    // [n_distances] 1/m; owned
     double distance_std_relative;    // mean over the lights
     double inflation;                // of the distances' variances over independent samples
     struct misfit misfit;            // what is left of the pictures
@@ -59,10 +60,9 @@ struct joint_result {
     unsigned doubts;                 // 0: trusted
 };
 
-// lights: from the panorama, with the rough set-up (centre, rotation) in it; lights->group (0 ..
-// n_groups - 1, ascending; lights_refine) says which share a distance; all -1: aligned runs of n / n_groups do. hold_out[n_views]: 1 = never
-// fitted, only reported. rays may be NULL (no visibility). Progress through progress.h. 0, -EINVAL (logged), -ENOMEM.
+// lights: from the panorama, with the rough set-up (centre, rotation) in it; lights->group says which share a distance
+// (lights_number_distances). hold_out[n_views]: 1 = never fitted, only reported. rays may be NULL (no visibility). Progress through progress.h. 0, -EINVAL (logged), -ENOMEM.
 int joint_solve(struct joint_result *out, const struct texels *texels, const struct samples *samples,
-                const struct rays *rays, const struct lights *lights, int n_groups,
-                const uint8_t *hold_out, const struct joint_settings *settings);
+                const struct rays *rays, const struct lights *lights, const uint8_t *hold_out,
+                const struct joint_settings *settings);
 void joint_result_free(struct joint_result *r);

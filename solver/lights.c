@@ -346,6 +346,18 @@ static void clear_light(struct lights *l, int i)
     memset(l->dir_probe[i], 0, sizeof(l->dir_probe[i]));
 }
 
+int lights_number_distances(const struct lights *l, int32_t *distance_of)
+{
+    int n = 0;
+    for (int i = 0; i < l->n; i++) {
+        int first = i > 0 && l->group[i] >= 0 && l->group[i] == l->group[i - 1] ? i - 1 : 0; // groups are mostly runs
+        while (first < i && (l->group[i] < 0 || l->group[first] != l->group[i]))
+            first++;
+        distance_of[i] = first < i ? distance_of[first] : n++;
+    }
+    return n;
+}
+
 int lights_refine(struct lights *out, const struct lights *from, const struct panorama *p, int n)
 {
     struct lights l = {0};

@@ -32,6 +32,9 @@ enum { LIGHTS_MAX = 65536 };
 // Zeroed set-up: c = 0, R = identity, all directional, no group. 0 or -ENOMEM.
 int lights_new(struct lights *out, int n);
 void lights_free(struct lights *l); // leaves it zeroed
+// Which unknown distance each light has, into distance_of[n]: lights of one group share one, of group -1 each has its own. Numbered
+// from 0 as they come. How many.
+int lights_number_distances(const struct lights *l, int32_t *distance_of);
 
 // Median cut (Debevec 2005): n = 2^k regions, 1 <= n <= LIGHTS_MAX, that partition the panorama;
 // each is split along its longer side (width x cos(elevation of its centre)) where the luminance

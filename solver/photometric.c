@@ -52,6 +52,7 @@ int photometric_state_new(struct photometric_state *out, const struct photometri
     memcpy(out->lights.dir_probe, lights->dir_probe, n * sizeof(*lights->dir_probe));
     memcpy(out->lights.irradiance, lights->irradiance, n * sizeof(*lights->irradiance));
     memcpy(out->lights.inverse_distance, lights->inverse_distance, n * sizeof(double));
+    memcpy(out->lights.group, lights->group, n * sizeof(*lights->group));
     memcpy(out->lights.centre_m, lights->centre_m, sizeof(lights->centre_m));
     memcpy(out->lights.world_from_probe, lights->world_from_probe, sizeof(lights->world_from_probe));
     for (size_t t = 0; t < n_texels; t++)

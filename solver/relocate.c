@@ -24,7 +24,7 @@ static int measure_aside(struct stage1 *s, const uint8_t *aside, double *percent
 }
 
 int relocate_lights(struct photometric_state *state, const struct texels *texels, const struct samples *samples, const struct rays *rays,
-                    int n_groups, const uint8_t *hold_out, const float (*theta)[DISNEY_N], const struct joint_settings *settings,
+                    const uint8_t *hold_out, const float (*theta)[DISNEY_N], const struct joint_settings *settings,
                     double *error_before, double *error_after)
 {
     const int n_views = samples->n_views;
@@ -34,11 +34,9 @@ int relocate_lights(struct photometric_state *state, const struct texels *texels
     int32_t *group = malloc((size_t)state->lights.n * sizeof(*group));
     uint8_t *fit = calloc((size_t)n_views + 1, 1), *aside = calloc((size_t)n_views + 1, 1);
     struct photometric p = { .texels = texels, .samples = samples, .model = REFLECT_DISNEY, .variant = set.variant, .albedo = ALBEDO_FREE,
-                             .group_of_light = group, .n_groups = n_groups, .use_view = fit, .texel_step = 1, .n_threads = set.n_threads,
+                             .group_of_light = group, .n_groups = group ? lights_number_distances(&state->lights, group) : 0, .use_view = fit, .texel_step = 1, .n_threads = set.n_threads,
                              .theta_of_texel = theta };
     int err = group && fit && aside ? 0 : -ENOMEM;
-    for (int i = 0; !err && i < state->lights.n; i++)
-        group[i] = i / (state->lights.n / n_groups);
     for (int v = 0, seen = 0; !err && v < n_views; v++)
         if (!(hold_out && hold_out[v])) {
             aside[v] = seen++ % 6 == 3;
@@ -50,6 +48,7 @@ int relocate_lights(struct photometric_state *state, const struct texels *texels
         err = photometric_state_new(&best, &p, &state->lights);
     if (err)
         goto end;
+    stage1_keep_ratios(&s);
     memcpy(s.base.theta, state->theta, sizeof(s.base.theta));
     memcpy(s.base.albedo, state->albedo, (size_t)texels->n * sizeof(*state->albedo));
     memcpy(s.base.log_gain, state->log_gain, (size_t)n_views * sizeof(double));

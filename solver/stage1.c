@@ -242,16 +242,6 @@ void stage1_add_prior(const struct stage1 *s, double *P)
         P[(size_t)(s->layout.gain + v) * n + s->layout.gain + v] += gain_precision();
 }
 
-int stage1_normal_equations(struct stage1 *s, double *cost, double *A, double *g)
-{
-    const bool in_distance = s->in_distance;
-    s->in_distance = false;
-    photometric_pack(&s->p, &s->base, s->x);
-    const int err = normal_callback(s, s->x, cost, A, g);
-    s->in_distance = in_distance;
-    return err;
-}
-
 static void set_bounds(struct stage1 *s)
 {
     const struct photometric_layout *l = &s->layout;
@@ -288,6 +278,23 @@ void stage1_set_planes(struct stage1 *s, struct emitters *e, double w_plane)
             s->ratio[i] = (float)fmin(fmax(vec3_dot(m, s->base.lights.dir_probe[i]) / vec3_dot(m, s->group_dir[g]), .5), 2);
         s->base.lights.inverse_distance[i] = q[g] * (double)s->ratio[i];
     }
+}
+
+void stage1_keep_ratios(struct stage1 *s)
+{
+    const struct lights *l = &s->base.lights;
+    for (int g = 0; g < s->p.n_groups; g++) {
+        double sum = 0;
+        int n = 0;
+        bool infinite = false;
+        for (int i = 0; i < l->n; i++)
+            if (s->p.group_of_light[i] == g)
+                sum += l->inverse_distance[i], n++, infinite |= l->inverse_distance[i] <= 0;
+        for (int i = 0; i < l->n; i++)
+            if (s->p.group_of_light[i] == g)
+                s->ratio[i] = infinite ? 1 : (float)(l->inverse_distance[i] * n / sum);
+    }
+    s->p.ratio_of_light = s->ratio;
 }
 
 int stage1_trace_visibility(struct stage1 *s)
@@ -343,7 +350,7 @@ void stage1_set_distances(struct stage1 *s, double distance_m)
 // ---- a stage's life --------------------------------------------------------------------------------------------------------
 
 int stage1_new(struct stage1 *s, const struct photometric *p, const struct lights *lights, const struct rays *rays,
-                      const struct joint_settings *set)
+               const struct joint_settings *set)
 {
     memset(s, 0, sizeof(*s));
     s->set = set, s->p = *p, s->rays = rays;
@@ -420,6 +427,7 @@ int stage1_measure(const struct stage1 *s, const struct photometric_state *state
     free(fitted);
     return err;
 }
+
 // Every so many texels, so that about n_samples are left; odd, so as not to fall in step with the texture's rows.
 int stage1_step_for(const struct stage1 *s, int64_t n_samples)
 {

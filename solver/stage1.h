@@ -39,12 +39,12 @@ void stage1_set_distances(struct stage1 *s, double distance_m); // of all lights
 // Holds the lights of each plane on it (tilt and all: finer lights of one group follow the plane) by w_plane; takes over e (zeroed after).
 // Planes of an earlier call are forgotten; e->n = 0: none.
 void stage1_set_planes(struct stage1 *s, struct emitters *e, double w_plane);
+// Lights of one group keep the ratio of their distances that they have now (a group with a light at infinity: all alike).
+void stage1_keep_ratios(struct stage1 *s);
 // Traces shadows when settings ask for them; later calls only the lights that have moved by more than .5 degrees.
 int stage1_trace_visibility(struct stage1 *s);
 // From base to base. cost may be NULL. 0 or -errno.
 int stage1_minimise(struct stage1 *s, int max_iterations, double relative_cost, double *cost);
-// The normal equations of the mean of squares + E_sim at base, in 1/r. A, g zeroed by the caller.
-int stage1_normal_equations(struct stage1 *s, double *cost, double *A, double *g);
 // What is known of the unknowns before any picture, as a precision added to P [n][n] (lower triangle): rooms (E_sim of log 1/r where a wall
 // seen at 45 degrees has a deviation of 1), planes where set, the centre's first guess, the cameras' gains.
 void stage1_add_prior(const struct stage1 *s, double *P);

@@ -393,18 +393,19 @@ static inline int stability_change_panorama(struct input *in, const struct studi
     return 0;
 }
 
-static inline void stability_darken_strongest(struct lights *l, int n_sub)
+static inline void stability_darken_strongest(struct lights *l)
 {
+    double luminance[l->n];
     int strongest = 0;
-    double most = 0;
-    for (int i = 0; i < l->n; i += n_sub) {
-        double luminance = 0;
-        for (int k = i; k < i + n_sub; k++)
-            luminance += judge_light_luminance(l, k);
-        if (luminance > most)
-            most = luminance, strongest = i;
-    }
-    memset(l->irradiance[strongest], 0, (size_t)n_sub * sizeof(*l->irradiance));
+    memset(luminance, 0, sizeof(luminance));
+    for (int i = 0; i < l->n; i++)
+        luminance[l->group[i]] += judge_light_luminance(l, i);
+    for (int g = 1; g < l->n; g++)
+        if (luminance[g] > luminance[strongest])
+            strongest = g;
+    for (int i = 0; i < l->n; i++)
+        if (l->group[i] == strongest)
+            memset(l->irradiance[i], 0, sizeof(l->irradiance[i]));
 }
 
 static inline int input_make(struct input *in, const struct studio *s, const struct perturbation *p, int n_threads)
@@ -431,7 +432,7 @@ static inline int input_make(struct input *in, const struct studio *s, const str
         return err;
     }
     if (p->missing == STRONGEST_LIGHT_MISSING)
-        stability_darken_strongest(&in->lights, stability_n_sub(s, p->method));
+        stability_darken_strongest(&in->lights);
     if (p->gain > 0 || p->noise > 0 || p->clipped > 0)
         stability_expose(in, p);
     const char *picture[s->cameras.n];
@@ -471,14 +472,22 @@ static inline int stability_by_double(const void *a, const void *b)
     return (x > y) - (x < y);
 }
 
+// 1/r of every group: its first light's.
+static inline void stability_distances(double *q, const struct lights *l)
+{
+    for (int i = l->n - 1; i >= 0; i--)
+        q[l->group[i]] = l->inverse_distance[i];
+}
+
 // Of the lights that shine: deviation of 1/r over 1/r, median and mean, in percent.
 static inline void stability_spread(double percent[2], const struct lights *l, int n_groups, const double *deviation)
 {
-    double relative[n_groups], sum = 0;
+    double relative[n_groups], q[n_groups], sum = 0;
     int n = 0;
-    for (int g = 0, run = l->n / n_groups; g < n_groups; g++)
-        if (isfinite(deviation[g]) && l->inverse_distance[g * run] > 0)
-            sum += relative[n++] = 100 * deviation[g] / l->inverse_distance[g * run];
+    stability_distances(q, l);
+    for (int g = 0; g < n_groups; g++)
+        if (isfinite(deviation[g]) && q[g] > 0)
+            sum += relative[n++] = 100 * deviation[g] / q[g];
     qsort(relative, (size_t)n, sizeof(double), stability_by_double);
     percent[0] = n ? relative[n / 2] : NAN, percent[1] = n ? sum / n : NAN;
 }
@@ -487,11 +496,11 @@ static inline void stability_spread(double percent[2], const struct lights *l, i
 static inline void stability_prior(double *prior, const struct lights *l, int n_groups, const struct photometric_layout *layout)
 {
     enum { N_NEIGHBOURS = 8 };
-    const int run = l->n / n_groups;
-    double dir[n_groups][3];
+    double dir[n_groups][3], q[n_groups];
+    stability_distances(q, l);
     memset(dir, 0, sizeof(dir));
     for (int i = 0; i < l->n; i++)
-        vec3_add_scaled(dir[i / run], dir[i / run], judge_light_luminance(l, i), l->dir_probe[i]);
+        vec3_add_scaled(dir[l->group[i]], dir[l->group[i]], judge_light_luminance(l, i), l->dir_probe[i]);
     for (int i = 0; i < n_groups; i++)
         vec3_normalise(dir[i]);
     for (int i = 0; i < n_groups; i++) {
@@ -505,7 +514,7 @@ static inline void stability_prior(double *prior, const struct lights *l, int n_
             taken[nearest] = true;
             double off[3];
             vec3_sub(off, dir[i], dir[nearest]);
-            const double qi = l->inverse_distance[i * run], qj = l->inverse_distance[nearest * run];
+            const double qi = q[i], qj = q[nearest];
             const double w = 1 / fmax(vec3_dot(off, off), 1e-6) / N_NEIGHBOURS;
             const size_t n = (size_t)layout->n, a = (size_t)(layout->inverse_distance + i), b = (size_t)(layout->inverse_distance + nearest);
             if (!(qi > 0 && qj > 0))
@@ -584,7 +593,7 @@ static inline void stability_run(struct stability_result *out, const struct stud
     if (out->err)
         return;
     clock_gettime(CLOCK_MONOTONIC, &begin);
-    out->err = joint_solve(&r, &in.texels, &in.samples, in.rays, &in.lights, s->size.n_lights, in.held_out, &set);
+    out->err = joint_solve(&r, &in.texels, &in.samples, in.rays, &in.lights, in.held_out, &set);
     clock_gettime(CLOCK_MONOTONIC, &end);
     out->seconds = (double)(end.tv_sec - begin.tv_sec) + 1e-9 * (double)(end.tv_nsec - begin.tv_nsec);
     if (!out->err) {

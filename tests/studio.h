@@ -24,7 +24,7 @@ static inline int studio_true_lights(struct lights *out, const char *take_dir)
     if (!err)
         err = lights_read_json(out, path);
     for (int i = 0; !err && i < out->n; i++)
-        out->inverse_distance[i] = 0;
+        out->inverse_distance[i] = 0, out->group[i] = -1;
     return err;
 }
 
@@ -54,6 +54,8 @@ static inline int studio_open(struct studio *s, const char *take_dir, int textur
     for (int c = 0; !err && c < 3; c++)
         s->lights.centre_m[c] = (s->mesh.bounds_m[0][c] + s->mesh.bounds_m[1][c]) / 2;
     s->n_lights = s->lights.n / n_sub;
+    for (int i = 0; n_sub > 1 && i < s->lights.n; i++)
+        s->lights.group[i] = i / n_sub;
     if (!err) {
         picture = calloc((size_t)s->cameras.n, sizeof(*picture));
         s->held_out = calloc((size_t)s->cameras.n, 1);
@@ -81,7 +83,7 @@ static inline void studio_close(struct studio *s)
 
 static inline int studio_solve(struct joint_result *out, const struct studio *s, const struct joint_settings *set)
 {
-    return joint_solve(out, &s->texels, &s->samples, s->rays, &s->lights, s->n_lights, s->held_out, set);
+    return joint_solve(out, &s->texels, &s->samples, s->rays, &s->lights, s->held_out, set);
 }
 
 // Centre, rotation, distances and places of the lights against the truth.

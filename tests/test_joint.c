@@ -53,6 +53,8 @@ static int open_studio(int data_set)
         err = panorama_read(&s->panorama, take->panorama_path);
     if (!err)
         err = lights_median_cut(&s->lights, &s->panorama, N_LIGHTS * N_SUB);
+    for (int i = 0; !err && i < s->lights.n; i++)
+        s->lights.group[i] = i / N_SUB;
     if (!err)
         err = lights_read_pose(&s->lights, &(bool){false}, take->start_path);
     for (int c = 0; !err && c < 3; c++)
@@ -110,8 +112,7 @@ static struct joint_settings settings_of(int data_set, enum method method)
 
 static int solve(struct joint_result *out, const struct studio *s, const struct joint_settings *set)
 {
-    return joint_solve(out, &s->texels, &s->samples, s->rays, &s->lights, N_LIGHTS, s->held_out,
-                       set);
+    return joint_solve(out, &s->texels, &s->samples, s->rays, &s->lights, s->held_out, set);
 }
 
 static const struct joint_result *solved(int data_set, enum method method)
@@ -348,14 +349,14 @@ static void empty_lights_change_nothing(void **state)
            sizeof(s->lights.world_from_probe));
     for (int i = 0; i < more.lights.n; i++) {
         const int k = i % s->lights.n;
+        more.lights.group[i] = i / N_SUB;
         memcpy(more.lights.dir_probe[i], s->lights.dir_probe[k], sizeof(*s->lights.dir_probe));
         if (i < s->lights.n)
             memcpy(more.lights.irradiance[i], s->lights.irradiance[k],
                    sizeof(*s->lights.irradiance));
     }
     assert_int_equal(joint_solve(&r, &more.texels, &more.samples, more.rays, &more.lights,
-                                 2 * N_LIGHTS, more.held_out, &set),
-                     0);
+                                 more.held_out, &set), 0);
     assert_int_equal(r.doubts, 0);
     below("RMSE held out, change in %",
           fabs(r.rmse_held_out_percent - expected->rmse_held_out_percent), 1e-3);

@@ -1360,6 +1360,22 @@ static void the_white_patch_is_predicted_from_the_panorama_at_its_place(void **s
     }
 }
 
+static void unknown_distances_are_numbered_as_groups_come(void **state)
+{
+    (void)state;
+    static const int32_t group[] = {7, 7, -1, 2, 7, -1, 2, 2, 0}, expected[] = {0, 0, 1, 2, 0, 3, 2, 2, 4};
+    enum { N = sizeof(group) / sizeof(group[0]) };
+    struct lights l;
+    int32_t found[N];
+    assert_int_equal(lights_new(&l, N), 0);
+    assert_int_equal(lights_number_distances(&l, found), N); // no group at all
+    assert_int_equal(found[N - 1], N - 1);
+    memcpy(l.group, group, sizeof(group));
+    assert_int_equal(lights_number_distances(&l, found), 5);
+    assert_memory_equal(found, expected, sizeof(expected));
+    lights_free(&l);
+}
+
 int main(void)
 {
     const struct CMUnitTest tests[] = {
@@ -1389,6 +1405,7 @@ int main(void)
         cmocka_unit_test(a_pose_that_is_no_rotation_is_refused_and_changes_nothing),
         cmocka_unit_test(panels_of_the_studios_are_found_by_the_cut),
         cmocka_unit_test(the_white_patch_is_predicted_from_the_panorama_at_its_place),
+        cmocka_unit_test(unknown_distances_are_numbered_as_groups_come),
     };
     return cmocka_run_group_tests(tests, make_folder, remove_folder);
 }

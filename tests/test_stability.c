@@ -59,7 +59,7 @@ static void distances_of(double *distance_m, const struct studio *s, const struc
     struct input in;
     struct joint_result r;
     assert_int_equal(input_make(&in, s, p, 0), 0);
-    assert_int_equal(joint_solve(&r, &in.texels, &in.samples, in.rays, &in.lights, s->size.n_lights, in.held_out, &set), 0);
+    assert_int_equal(joint_solve(&r, &in.texels, &in.samples, in.rays, &in.lights, in.held_out, &set), 0);
     for (int i = in.lights.n - 1; i >= 0; i--) // of each group, its first
         distance_m[in.lights.group[i]] = 1 / r.state.lights.inverse_distance[i];
     joint_result_free(&r);

@@ -190,7 +190,7 @@ int solve_read_lights(struct joint_result *out, struct lights *lights, const str
 
 // ---- the stage ----------------------------------------------------------------------------------------------------------
 
-int solve_find_materials(struct materials *out, const struct solve_materials *set, struct joint_result *stage1, int n_groups,
+int solve_find_materials(struct materials *out, const struct solve_materials *set, struct joint_result *stage1,
                          const struct joint_settings *joint, const struct inputs *in, const struct samples *samples, const uint8_t *held_out,
                          int n_threads)
 {
@@ -221,7 +221,7 @@ int solve_find_materials(struct materials *out, const struct solve_materials *se
         settings.most_size = set->most_size && set->most_size < 64 ? set->most_size : 64, settings.look = true;
         err = materials_solve(&look, &input, &settings);
         if (!err)
-            err = relocate_lights(&stage1->state, &in->texels, samples, in->rays, n_groups, held_out, (const float(*)[DISNEY_N])look.theta, joint,
+            err = relocate_lights(&stage1->state, &in->texels, samples, in->rays, held_out, (const float(*)[DISNEY_N])look.theta, joint,
                                   &before, &after);
         materials_free(&look);
         if (!err && visibility.bits)
