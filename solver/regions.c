@@ -15,6 +15,7 @@ const char *const parameter_freedom_names[3] = { "frozen", "tied", "free" };
 enum {
     FIRST_REGIONS = 6,    // cut into so many before merging
     WITNESSES = 192,      // texels a region is fitted to
+    EXPLORERS = 48,       // of them, where many places are tried
     DEAL_ROUNDS = 3,
     PATCHES = 64,         // of the surface: within one, errors of the model go together
     MOST_VIEWS = 2048,
@@ -89,6 +90,8 @@ struct shared_fit {
     const struct witnesses *w;
     uint16_t frozen;         // parameters that stay plain
     float theta[DISNEY_N];
+    double sums[1 + DISNEY_N + THETA_PACKED]; // at theta
+    bool known;
 };
 
 static void add_witnesses(void *arg, int64_t begin, int64_t end, int worker, double *partial)
@@ -108,10 +111,16 @@ static void add_witnesses(void *arg, int64_t begin, int64_t end, int worker, dou
 static int shared_equations(void *arg, const double *x, double *cost, double *A, double *g)
 {
     struct shared_fit *f = arg;
-    double sums[1 + DISNEY_N + THETA_PACKED] = { 0 };
-    for (int p = 0; p < DISNEY_N; p++)
+    bool known = f->known; // a step that is taken was just looked at
+    for (int p = 0; p < DISNEY_N; p++) {
+        known = known && f->theta[p] == (float)x[p];
         f->theta[p] = (float)x[p];
-    const int err = parallel_sum(f->s->n_threads, f->w->n, 4, add_witnesses, f, 1 + DISNEY_N + THETA_PACKED, sums);
+    }
+    if (!known)
+        memset(f->sums, 0, sizeof(f->sums));
+    const double *sums = f->sums;
+    const int err = known ? 0 : parallel_sum(f->s->n_threads, f->w->n, 4, add_witnesses, f, 1 + DISNEY_N + THETA_PACKED, f->sums);
+    f->known = !err;
     *cost = sums[0];
     for (int p = 0; p < DISNEY_N; p++) {
         const double d = x[p] - (double)plain[p];
@@ -157,11 +166,14 @@ static int fit_shared(struct search *s, const struct texel_scene *scene, const s
                       float theta[DISNEY_N])
 {
     static const float starts[][2] = { { 0, .15f }, { 0, .35f }, { 0, .7f }, { 1, .2f }, { 1, .45f } }; // metallic, roughness
-    struct shared_fit f = { .s = s, .scene = scene, .w = w, .frozen = frozen };
+    struct witnesses some = { 0 }; // are enough to choose a place
+    struct shared_fit f = { .s = s, .scene = scene, .w = anywhere ? &some : w, .frozen = frozen };
     float best[DISNEY_N];
     double least;
     if (!w->n)
         return 0;
+    for (int k = 0; k < EXPLORERS && k < w->n; k++)
+        some.texel[some.n++] = w->texel[(int64_t)k * w->n / (w->n < EXPLORERS ? w->n : EXPLORERS)];
     int err = fit_from(&f, theta, anywhere ? 8 : 30, 1e-5, best, &least);
     for (size_t k = 0; !err && anywhere && k < sizeof(starts) / sizeof(*starts); k++) {
         float from[DISNEY_N], to[DISNEY_N];
@@ -174,6 +186,7 @@ static int fit_shared(struct search *s, const struct texel_scene *scene, const s
             memcpy(best, to, sizeof(best));
         }
     }
+    f.w = w, f.known = false;
     if (!err && anywhere)
         err = fit_from(&f, best, 30, 1e-5, best, &least);
     if (!err)
@@ -263,7 +276,7 @@ static void test_witnesses(void *arg, int64_t begin, int64_t end, int worker, do
         if (t->free_mask)
             fit_own(t, t->s->worker[worker], k, theta, albedo);
         else
-            texel_fit(&t->s->inner, t->s->worker[worker], t->w->texel[k], 0, theta, albedo, 1, &sums);
+            texel_fit_albedo(&t->s->inner, t->s->worker[worker], t->w->texel[k], 0, theta, albedo, 1, &sums);
         texel_measure(&t->s->aside, t->s->worker[worker], t->w->texel[k], theta, albedo, &error);
         t->error2[k] = error.n ? (float)(error.squares / (3 * (double)error.n)) : 0;
         partial[0] += error.squares, partial[1] += 3 * (double)error.n;
@@ -305,7 +318,7 @@ static void cost_nodes(void *arg, int64_t begin, int64_t end, int worker)
             if (s->texel[i] < 0)
                 continue;
             memcpy(albedo, s->albedo[s->texel[i]], sizeof(albedo));
-            texel_fit(s->scene, s->worker[worker], s->texel[i], 0, s->out->region[r].theta, albedo, 1, &sums);
+            texel_fit_albedo(s->scene, s->worker[worker], s->texel[i], 0, s->out->region[r].theta, albedo, 1, &sums);
             s->cost[i * REGIONS_MAX + r] = (float)(sums.cost / fmax(sums.n, 1));
         }
 }
@@ -598,7 +611,7 @@ static int region_uncertainty(struct search *s, const struct witnesses *w, uint1
     for (int k = 0; !err && k < w->n; k++) {
         const struct texel_row *rows;
         struct texel_sums sums = { 0 };
-        texel_fit(s->scene, s->worker[0], w->texel[k], 0, r->theta, s->albedo[w->texel[k]], 1, &sums);
+        texel_fit_albedo(s->scene, s->worker[0], w->texel[k], 0, r->theta, s->albedo[w->texel[k]], 1, &sums);
         const int n = texel_rows(s->scene, s->worker[0], w->texel[k], r->theta, s->albedo[w->texel[k]], &rows);
         double own[6] = { 1e-12, 0, 1e-12, 0, 0, 1e-12 }, mixed[DISNEY_N][3] = { { 0 } };
         for (int i = 0; i < n; i++)
@@ -843,7 +856,7 @@ static void cost_doubtful(void *arg, int64_t begin, int64_t end, int worker)
                 const int32_t t = l->first_delegate ? l->delegate[first + d] : i;
                 float albedo[3];
                 memcpy(albedo, f->albedo[t], sizeof(albedo));
-                texel_fit(f->scene, f->worker[worker], t, 0, f->r->region[r].theta, albedo, 1, &sums);
+                texel_fit_albedo(f->scene, f->worker[worker], t, 0, f->r->region[r].theta, albedo, 1, &sums);
             }
             if (f->candidates[i] >> r & 1)
                 cost[r] = (float)(sums.cost / fmax(sums.n, 1));
