@@ -22,6 +22,7 @@ enum {
 };
 static const double least_share = .03;       // a smaller region is dissolved: what borders and rims look like, mostly
 static const double worth_a_region = 1.10;   // squared error of views set aside, of one reflectance for two regions
+static const double certain = 3;             // standard deviations between two regions' values of a parameter
 static const double worth_a_parameter = .97; // the same with a parameter free per texel
 static const double worth_a_layer = 1.01;    // the same without clearcoat, sheen, ...
 static const double better_without = .99;
@@ -529,79 +530,9 @@ static int dissolve_small(struct search *s)
     return err;
 }
 
-// By what factor the witnesses' errors grow from `alone` to `shared`: the mean over them of the logarithm, as texels are very unlike; and as
-// much less as could be chance (four standard errors).
-static double how_much_worse(const float *shared, const float *alone, int n)
-{
-    double sum = 0, squares = 0;
-    for (int k = 0; k < n; k++) {
-        const double worse = log(((double)shared[k] + rounding2) / ((double)alone[k] + rounding2));
-        sum += worse, squares += worse * worse;
-    }
-    if (n < 2)
-        return 1;
-    const double mean = sum / n, variance = fmax(squares / n - mean * mean, 0) / (n - 1);
-    return exp(mean - 4 * sqrt(variance));
-}
-
-// As long as two regions do as well under one reflectance, they are one.
-static int merge(struct search *s)
-{
-    int err = 0;
-    while (!err && s->out->n > 1) {
-        double least = INFINITY, error2;
-        float alone[REGIONS_MAX][WITNESSES];
-        struct witnesses w[REGIONS_MAX];
-        float best_theta[DISNEY_N];
-        int best_a = 0, best_b = 0;
-        for (int r = 0; !err && r < s->out->n; r++) {
-            call_witnesses(s, 1u << r, &w[r]);
-            err = test(s, &w[r], s->out->region[r].theta, 0, -1, &error2, NULL, alone[r]);
-        }
-        for (int a = 0; !err && a < s->out->n; a++)
-            for (int b = a + 1; !err && b < s->out->n; b++) {
-                struct witnesses both = { 0 }; // as many of either
-                float theta[DISNEY_N];
-                float one[WITNESSES], other[WITNESSES];
-                for (int k = 0; k < WITNESSES / 2 && k < w[a].n; k++)
-                    both.texel[both.n++] = w[a].texel[(int64_t)k * w[a].n / (w[a].n < WITNESSES / 2 ? w[a].n : WITNESSES / 2)];
-                for (int k = 0; k < WITNESSES / 2 && k < w[b].n; k++)
-                    both.texel[both.n++] = w[b].texel[(int64_t)k * w[b].n / (w[b].n < WITNESSES / 2 ? w[b].n : WITNESSES / 2)];
-                for (int p = 0; p < DISNEY_N; p++)
-                    theta[p] = .5f * (s->out->region[a].theta[p] + s->out->region[b].theta[p]);
-                err = fit_shared(s, &s->inner, &both, 0, false, theta);
-                if (!err)
-                    err = test(s, &w[a], theta, 0, -1, &error2, NULL, one);
-                if (!err)
-                    err = test(s, &w[b], theta, 0, -1, &error2, NULL, other);
-                const double ratio = err ? INFINITY : fmax(how_much_worse(one, alone[a], w[a].n), how_much_worse(other, alone[b], w[b].n));
-                if (!err && ratio < least) {
-                    least = ratio, best_a = a, best_b = b;
-                    memcpy(best_theta, theta, sizeof(theta));
-                }
-            }
-        if (!err && least > worth_a_region)
-            log_debug("regions: %d and %d of %d stay apart: views aside %.4f x", best_a, best_b, s->out->n, least);
-        if (err || least > worth_a_region)
-            break;
-        log_debug("regions: %d and %d of %d become one: views aside %.4f x", best_a, best_b, s->out->n, least);
-        rename_region(s, best_b, best_a);
-        memcpy(s->out->region[best_a].theta, best_theta, sizeof(best_theta));
-        drop(s, best_b);
-        err = fit_all(s, false);
-        if (!err)
-            err = deal_out(s);
-        if (!err)
-            err = dissolve_small(s);
-    }
-    return err;
-}
-
-// ---- what is free -------------------------------------------------------------------------------------------------------
-
 // Covariance of a region's theta, albedos eliminated: A^-1 B A^-1 with B the sum of squared scores by view and by patch of the surface:
 // what the model lacks goes together there, and noise does not know it.
-static int region_uncertainty(struct search *s, const struct witnesses *w, uint16_t frozen, struct region *r)
+static int region_uncertainty(struct search *s, const struct texel_scene *scene, const struct witnesses *w, uint16_t frozen, struct region *r)
 {
     double A[THETA_PACKED] = { 0 }, B[THETA_PACKED] = { 0 }, C[DISNEY_N][DISNEY_N] = { { 0 } };
     const int n_views = s->scene->samples->n_views;
@@ -611,8 +542,8 @@ static int region_uncertainty(struct search *s, const struct witnesses *w, uint1
     for (int k = 0; !err && k < w->n; k++) {
         const struct texel_row *rows;
         struct texel_sums sums = { 0 };
-        texel_fit_albedo(s->scene, s->worker[0], w->texel[k], 0, r->theta, s->albedo[w->texel[k]], 1, &sums);
-        const int n = texel_rows(s->scene, s->worker[0], w->texel[k], r->theta, s->albedo[w->texel[k]], &rows);
+        texel_fit_albedo(scene, s->worker[0], w->texel[k], 0, r->theta, s->albedo[w->texel[k]], 1, &sums);
+        const int n = texel_rows(scene, s->worker[0], w->texel[k], r->theta, s->albedo[w->texel[k]], &rows);
         double own[6] = { 1e-12, 0, 1e-12, 0, 0, 1e-12 }, mixed[DISNEY_N][3] = { { 0 } };
         for (int i = 0; i < n; i++)
             for (int a = 0; a < 3; a++) {
@@ -681,6 +612,101 @@ static int region_uncertainty(struct search *s, const struct witnesses *w, uint1
     return 0;
 }
 
+// By what factor the witnesses' errors grow from `alone` to `shared`: the mean over them of the logarithm, as texels are very unlike; and as
+// much less as could be chance (four standard errors).
+static double how_much_worse(const float *shared, const float *alone, int n)
+{
+    double sum = 0, squares = 0;
+    for (int k = 0; k < n; k++) {
+        const double worse = log(((double)shared[k] + rounding2) / ((double)alone[k] + rounding2));
+        sum += worse, squares += worse * worse;
+    }
+    if (n < 2)
+        return 1;
+    const double mean = sum / n, variance = fmax(squares / n - mean * mean, 0) / (n - 1);
+    return exp(mean - 4 * sqrt(variance));
+}
+
+// By how many of its standard deviations the parameter differs that tells two regions apart best.
+static double apart_in_std(const struct region *a, const struct region *b)
+{
+    double most = 0;
+    for (int p = 0; p < DISNEY_N; p++) {
+        const int at = packed_at(p, p);
+        const double d = (double)(a->theta[p] - b->theta[p]), std = unknown_misfit * sqrt(a->covariance[at] + b->covariance[at]);
+        most = fmax(most, fabs(d) / std);
+    }
+    return most;
+}
+
+// As many of either.
+static void call_both(const struct witnesses *a, const struct witnesses *b, struct witnesses *both)
+{
+    both->n = 0;
+    for (int side = 0; side < 2; side++) {
+        const struct witnesses *w = side ? b : a;
+        const int n = w->n < WITNESSES / 2 ? w->n : WITNESSES / 2;
+        for (int k = 0; k < n; k++)
+            both->texel[both->n++] = w->texel[(int64_t)k * w->n / n];
+    }
+}
+
+// Two regions are one if they do as well under one reflectance, or if no parameter of theirs differs by more than is known of it: where the
+// lights are wrong, any piece of the surface does better by itself.
+static int merge(struct search *s)
+{
+    int err = 0;
+    while (!err && s->out->n > 1) {
+        double least = INFINITY, error2;
+        float alone[REGIONS_MAX][WITNESSES];
+        struct witnesses w[REGIONS_MAX];
+        float best_theta[DISNEY_N];
+        int best_a = -1, best_b = -1;
+        for (int r = 0; !err && r < s->out->n; r++) {
+            call_witnesses(s, 1u << r, &w[r]);
+            err = test(s, &w[r], s->out->region[r].theta, 0, -1, &error2, NULL, alone[r]);
+            if (!err)
+                err = region_uncertainty(s, &s->inner, &w[r], 0, &s->out->region[r]);
+        }
+        for (int a = 0; !err && a < s->out->n; a++)
+            for (int b = a + 1; !err && b < s->out->n; b++) {
+                struct witnesses both;
+                float theta[DISNEY_N], one[WITNESSES], other[WITNESSES];
+                call_both(&w[a], &w[b], &both);
+                for (int p = 0; p < DISNEY_N; p++)
+                    theta[p] = .5f * (s->out->region[a].theta[p] + s->out->region[b].theta[p]);
+                err = fit_shared(s, &s->inner, &both, 0, false, theta);
+                if (!err)
+                    err = test(s, &w[a], theta, 0, -1, &error2, NULL, one);
+                if (!err)
+                    err = test(s, &w[b], theta, 0, -1, &error2, NULL, other);
+                if (err)
+                    break;
+                const double ratio = fmax(how_much_worse(one, alone[a], w[a].n), how_much_worse(other, alone[b], w[b].n));
+                const double apart = apart_in_std(&s->out->region[a], &s->out->region[b]);
+                log_debug("regions: %d and %d of %d as one: views aside %.4f x; theta %.1f standard deviations apart", a, b, s->out->n, ratio, apart);
+                if ((ratio <= worth_a_region || apart <= certain) && ratio < least) {
+                    least = ratio, best_a = a, best_b = b;
+                    memcpy(best_theta, theta, sizeof(theta));
+                }
+            }
+        if (err || best_a < 0)
+            break;
+        log_debug("regions: %d and %d of %d become one", best_a, best_b, s->out->n);
+        rename_region(s, best_b, best_a);
+        memcpy(s->out->region[best_a].theta, best_theta, sizeof(best_theta));
+        drop(s, best_b);
+        err = fit_all(s, false);
+        if (!err)
+            err = deal_out(s);
+        if (!err)
+            err = dissolve_small(s);
+    }
+    return err;
+}
+
+// ---- what is free -------------------------------------------------------------------------------------------------------
+
 // Does the region do without? What views set aside are better off without, or neither miss nor tell from plain by two standard deviations,
 // stays plain. Metal first: a little of it passes for anything.
 static int simplify(struct search *s, const struct witnesses *w, struct region *r, int at, uint16_t *frozen, double *error2,
@@ -695,7 +721,7 @@ static int simplify(struct search *s, const struct witnesses *w, struct region *
         struct region simpler = *r;
         const int p = __builtin_ctz(without[k]); // the layer's amount; the other says how it looks
         double error;
-        err = region_uncertainty(s, w, *frozen, r);
+        err = region_uncertainty(s, s->scene, w, *frozen, r);
         if (!k)
             *full = *r;
         if (!err)
@@ -749,7 +775,7 @@ static int choose_freedom(struct search *s, struct region *r, int at)
     if (!err && w.n) // to the end: clearcoat against sheen is a long valley
         err = fit_from(&last, r->theta, 100, 1e-8, r->theta, &cost);
     if (!err)
-        err = region_uncertainty(s, &w, frozen, r);
+        err = region_uncertainty(s, s->scene, &w, frozen, r);
     // What was frozen might have been otherwise: the doubt is that of the full model, and how far freezing moved the others.
     for (int p = 0; !err && p < DISNEY_N; p++)
         if (isfinite(r->std[p]))
