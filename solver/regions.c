@@ -22,7 +22,6 @@ enum {
 };
 static const double least_share = .03;       // a smaller region is dissolved: what borders and rims look like, mostly
 static const double worth_a_region = 1.10;   // squared error of views set aside, of one reflectance for two regions
-static const double certain = 3;             // standard deviations between two regions' values of a parameter
 static const double worth_a_parameter = .97; // the same with a parameter free per texel
 static const double worth_a_layer = 1.01;    // the same without clearcoat, sheen, ...
 static const double better_without = .99;
@@ -531,10 +530,12 @@ static int dissolve_small(struct search *s)
 }
 
 // Covariance of a region's theta, albedos eliminated: A^-1 B A^-1 with B the sum of squared scores by view and by patch of the surface:
-// what the model lacks goes together there, and noise does not know it.
-static int region_uncertainty(struct search *s, const struct texel_scene *scene, const struct witnesses *w, uint16_t frozen, struct region *r)
+// what the model lacks goes together there, and noise does not know it. leeway, or NULL: what share of the squared error theta takes up by
+// fitting such things, tr(A^-1 B) of the sum of squares (Takeuchi 1976).
+static int region_uncertainty(struct search *s, const struct texel_scene *scene, const struct witnesses *w, uint16_t frozen, struct region *r,
+                              double *leeway)
 {
-    double A[THETA_PACKED] = { 0 }, B[THETA_PACKED] = { 0 }, C[DISNEY_N][DISNEY_N] = { { 0 } };
+    double squares = 0, A[THETA_PACKED] = { 0 }, B[THETA_PACKED] = { 0 }, C[DISNEY_N][DISNEY_N] = { { 0 } };
     const int n_views = s->scene->samples->n_views;
     double(*by_view)[DISNEY_N] = calloc((size_t)n_views + 1, sizeof(*by_view)), (*by_patch)[DISNEY_N] = calloc(PATCHES, sizeof(*by_patch));
     double(*J)[DISNEY_N] = malloc(3 * TEXEL_VIEWS_MAX * sizeof(*J));
@@ -558,6 +559,7 @@ static int region_uncertainty(struct search *s, const struct texel_scene *scene,
             packed_solve(3, own, mixed[p]);
         for (int i = 0; i < n; i++) {
             const int patch = (int)((int64_t)k * PATCHES / w->n);
+            squares += (double)rows[i].residual * (double)rows[i].residual;
             for (int p = 0; p < DISNEY_N; p++) {
                 J[i][p] = (double)rows[i].J[p];
                 for (int a = 0; a < 3; a++)
@@ -597,6 +599,12 @@ static int region_uncertainty(struct search *s, const struct texel_scene *scene,
         inverse[p][p] = 1;
         packed_solve(DISNEY_N, A, inverse[p]);
     }
+    double taken = 0;
+    for (int p = 0; p < DISNEY_N; p++)
+        for (int q = 0; q < DISNEY_N; q++)
+            taken += inverse[p][q] * B[packed_at(p, q)];
+    if (leeway)
+        *leeway = regular && squares > 0 ? taken / squares : INFINITY;
     for (int p = 0; p < DISNEY_N; p++)
         for (int q = 0; q < DISNEY_N; q++)
             for (int a = 0; a < DISNEY_N; a++)
@@ -627,18 +635,6 @@ static double how_much_worse(const float *shared, const float *alone, int n)
     return exp(mean - 4 * sqrt(variance));
 }
 
-// By how many of its standard deviations the parameter differs that tells two regions apart best.
-static double apart_in_std(const struct region *a, const struct region *b)
-{
-    double most = 0;
-    for (int p = 0; p < DISNEY_N; p++) {
-        const int at = packed_at(p, p);
-        const double d = (double)(a->theta[p] - b->theta[p]), std = unknown_misfit * sqrt(a->covariance[at] + b->covariance[at]);
-        most = fmax(most, fabs(d) / std);
-    }
-    return most;
-}
-
 // As many of either.
 static void call_both(const struct witnesses *a, const struct witnesses *b, struct witnesses *both)
 {
@@ -651,22 +647,25 @@ static void call_both(const struct witnesses *a, const struct witnesses *b, stru
     }
 }
 
-// Two regions are one if they do as well under one reflectance, or if no parameter of theirs differs by more than is known of it: where the
-// lights are wrong, any piece of the surface does better by itself.
+// Two regions are one as long as both do as well under one reflectance: no worse than by a tenth of the squared error, or by what a
+// reflectance of their own takes up of anything. Where the lights are wrong every piece of the surface does better by itself, in views set
+// aside too, which share the lights' error; what is left of the pictures under a theta of its own says how much of that there is.
 static int merge(struct search *s)
 {
     int err = 0;
     while (!err && s->out->n > 1) {
-        double least = INFINITY, error2;
+        double least = INFINITY, error2, most_worse[REGIONS_MAX];
         float alone[REGIONS_MAX][WITNESSES];
         struct witnesses w[REGIONS_MAX];
         float best_theta[DISNEY_N];
         int best_a = -1, best_b = -1;
         for (int r = 0; !err && r < s->out->n; r++) {
+            double leeway;
             call_witnesses(s, 1u << r, &w[r]);
             err = test(s, &w[r], s->out->region[r].theta, 0, -1, &error2, NULL, alone[r]);
             if (!err)
-                err = region_uncertainty(s, &s->inner, &w[r], 0, &s->out->region[r]);
+                err = region_uncertainty(s, &s->inner, &w[r], 0, &s->out->region[r], &leeway);
+            most_worse[r] = fmax(worth_a_region, 1 + leeway);
         }
         for (int a = 0; !err && a < s->out->n; a++)
             for (int b = a + 1; !err && b < s->out->n; b++) {
@@ -682,15 +681,16 @@ static int merge(struct search *s)
                     err = test(s, &w[b], theta, 0, -1, &error2, NULL, other);
                 if (err)
                     break;
-                const double ratio = fmax(how_much_worse(one, alone[a], w[a].n), how_much_worse(other, alone[b], w[b].n));
-                const double apart = apart_in_std(&s->out->region[a], &s->out->region[b]);
-                log_debug("regions: %d and %d of %d as one: views aside %.4f x; theta %.1f standard deviations apart", a, b, s->out->n, ratio, apart);
-                if ((ratio <= worth_a_region || apart <= certain) && ratio < least) {
-                    least = ratio, best_a = a, best_b = b;
+                const double worse_a = how_much_worse(one, alone[a], w[a].n), worse_b = how_much_worse(other, alone[b], w[b].n);
+                const double worse = fmax(worse_a / most_worse[a], worse_b / most_worse[b]);
+                log_debug("regions: %d and %d of %d as one: views aside %.4f x, %.4f x; allowed %.4f, %.4f", a, b, s->out->n, worse_a, worse_b,
+                          most_worse[a], most_worse[b]);
+                if (worse < least) {
+                    least = worse, best_a = a, best_b = b;
                     memcpy(best_theta, theta, sizeof(theta));
                 }
             }
-        if (err || best_a < 0)
+        if (err || !(least <= 1))
             break;
         log_debug("regions: %d and %d of %d become one", best_a, best_b, s->out->n);
         rename_region(s, best_b, best_a);
@@ -721,7 +721,7 @@ static int simplify(struct search *s, const struct witnesses *w, struct region *
         struct region simpler = *r;
         const int p = __builtin_ctz(without[k]); // the layer's amount; the other says how it looks
         double error;
-        err = region_uncertainty(s, s->scene, w, *frozen, r);
+        err = region_uncertainty(s, s->scene, w, *frozen, r, NULL);
         if (!k)
             *full = *r;
         if (!err)
@@ -775,7 +775,7 @@ static int choose_freedom(struct search *s, struct region *r, int at)
     if (!err && w.n) // to the end: clearcoat against sheen is a long valley
         err = fit_from(&last, r->theta, 100, 1e-8, r->theta, &cost);
     if (!err)
-        err = region_uncertainty(s, s->scene, &w, frozen, r);
+        err = region_uncertainty(s, s->scene, &w, frozen, r, NULL);
     // What was frozen might have been otherwise: the doubt is that of the full model, and how far freezing moved the others.
     for (int p = 0; !err && p < DISNEY_N; p++)
         if (isfinite(r->std[p]))

@@ -22,9 +22,9 @@ struct studio { // a take with its true lights
     uint8_t held_out[N_VIEWS];
     struct materials solved; // by materials_defaults()
 };
-static struct studio d3, d5;
+static struct studio d3, d5, noiseless; // noiseless: D3
 
-static int open_studio(struct studio *s, int data_set, int texture, double noise)
+static int open_studio(struct studio *s, const char *name, int data_set, int texture, double noise)
 {
     struct synth_settings synth = synth_defaults(data_set);
     struct samples_settings gather = samples_defaults();
@@ -32,7 +32,7 @@ static int open_studio(struct studio *s, int data_set, int texture, double noise
     static char paths[N_VIEWS][1000];
     synth.n_true_lights = 64, synth.panorama_width_px = 256, synth.texture_size = 128;
     synth.width_px = 180, synth.height_px = 120, synth.n_views = N_VIEWS, synth.samples = 1, synth.noise = noise;
-    snprintf(s->take_dir, sizeof(s->take_dir), "%s/D%d", scratch_dir, data_set);
+    snprintf(s->take_dir, sizeof(s->take_dir), "%s/%s", scratch_dir, name);
     int err = synth_write(&synth, s->take_dir);
     if (!err)
         err = truth_open(&s->truth, s->take_dir);
@@ -74,7 +74,7 @@ static int open_studios(void **state)
 {
     (void)state;
     log_set_level(LOG_ERROR);
-    return scratch_open() || open_studio(&d3, 3, 48, .002) || open_studio(&d5, 5, 96, 0);
+    return scratch_open() || open_studio(&d3, "D3", 3, 48, .002) || open_studio(&d5, "D5", 5, 96, 0) || open_studio(&noiseless, "noiseless", 3, 32, 0);
 }
 
 static int remove_one(const char *path, const struct stat *st, int kind, struct FTW *at)
@@ -92,7 +92,7 @@ static void close_studio(struct studio *s)
 static int close_studios(void **state)
 {
     (void)state;
-    close_studio(&d3), close_studio(&d5);
+    close_studio(&d3), close_studio(&d5), close_studio(&noiseless);
     return nftw(scratch_dir, remove_one, 16, FTW_DEPTH | FTW_PHYS);
 }
 
@@ -262,6 +262,53 @@ static void one_material_stays_one_and_is_found(void **state)
     assert_true(fabs((double)r->theta[DISNEY_ROUGHNESS] - .6) < .03);
 }
 
+// Lights as a solve finds them: each some per cent too near or too far, the centre a centimetre off.
+static int lights_off(struct lights *out, const struct lights *from, double by, uint64_t seed)
+{
+    int err = lights_new(out, from->n);
+    if (err)
+        return err;
+    memcpy(out->world_from_probe, from->world_from_probe, sizeof(out->world_from_probe));
+    for (int c = 0; c < 3; c++)
+        out->centre_m[c] = from->centre_m[c] + .01 * random_normal(seed, 1000, (uint64_t)c);
+    for (int i = 0; i < from->n; i++) {
+        memcpy(out->dir_probe[i], from->dir_probe[i], sizeof(out->dir_probe[i]));
+        memcpy(out->irradiance[i], from->irradiance[i], sizeof(out->irradiance[i]));
+        out->inverse_distance[i] = from->inverse_distance[i] * (1 + by * random_normal(seed, 0, (uint64_t)i));
+        out->group[i] = from->group[i];
+    }
+    return 0;
+}
+
+static int n_regions_under_lights_off(const struct studio *s, double by, uint64_t seed)
+{
+    struct materials m;
+    struct lights off;
+    struct materials_input in = input_of(s);
+    struct materials_settings set = materials_defaults();
+    assert_int_equal(lights_off(&off, &s->truth.lights, by, seed), 0);
+    in.lights = &off;
+    set.look = true; // regions, nothing judged
+    assert_int_equal(materials_solve(&m, &in, &set), 0);
+    const int n = m.regions.n;
+    materials_free(&m), lights_free(&off);
+    return n;
+}
+
+static void lights_that_are_off_make_no_second_material(void **state)
+{
+    (void)state;
+    for (uint64_t seed = 1; seed <= 3; seed++)
+        assert_int_equal(n_regions_under_lights_off(&noiseless, .08, seed), 1);
+}
+
+static void lights_that_are_off_hide_no_material(void **state)
+{
+    (void)state;
+    for (uint64_t seed = 1; seed <= 2; seed++)
+        assert_in_range(n_regions_under_lights_off(&d5, .02, seed), 4, REGIONS_MAX);
+}
+
 static void what_is_said_to_be_known_is(void **state)
 {
     (void)state;
@@ -428,6 +475,8 @@ int main(void)
         cmocka_unit_test(gradient_of_a_texel_is_the_derivative_of_its_cost),
         cmocka_unit_test(a_step_by_pcg_is_that_of_the_dense_system),
         cmocka_unit_test(one_material_stays_one_and_is_found),
+        cmocka_unit_test(lights_that_are_off_make_no_second_material),
+        cmocka_unit_test(lights_that_are_off_hide_no_material),
         cmocka_unit_test(what_is_said_to_be_known_is),
         cmocka_unit_test(four_materials_are_told_apart),
         cmocka_unit_test(selection_beats_the_plain_fit_on_views_not_fitted),
