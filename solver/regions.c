@@ -28,7 +28,8 @@ static const double better_without = .99;
 static const double rounding2 = 3e-4 * 3e-4; // what half floats and look-ups leave in any comparison: to gain less is to gain nothing
 static const float unknown_misfit = 1.5f; // errors that neither views nor patches show: measured on D3 (90 % intervals over seeds)
 static const double most_free_std = .15;
-static const double hold = 1e-3;             // draws what nothing determines towards where it started, beside the sum of squares
+static const double first_hold = 1e-3;       // until the pictures' error is known
+static const double plain_variance = 1. / 12; // a parameter is somewhere in [0,1] before any picture
 static const double own_hold = .02;          // the same of one texel's own parameter
 
 // What a parameter is when nothing speaks for it.
@@ -44,6 +45,7 @@ struct search {
     int n_workers, n_threads;
     uint8_t *region;                     // [level n]
     float *cost;                         // [level n][REGIONS_MAX]
+    double hold;                         // draws what nothing determines towards plain, beside the sum of squares
     struct regions *out;
 };
 
@@ -84,13 +86,15 @@ static void call_witnesses(const struct search *s, unsigned mask, struct witness
 
 // ---- one reflectance for many texels ------------------------------------------------------------------------------------
 
+enum { N_SHARED = 1 + DISNEY_N + THETA_PACKED };
+
 struct shared_fit {
     struct search *s;
     const struct texel_scene *scene;
     const struct witnesses *w;
     uint16_t frozen;         // parameters that stay plain
     float theta[DISNEY_N];
-    double sums[1 + DISNEY_N + THETA_PACKED]; // at theta
+    double sums[N_SHARED];   // at theta: cost, g, H
     bool known;
 };
 
@@ -119,17 +123,17 @@ static int shared_equations(void *arg, const double *x, double *cost, double *A,
     if (!known)
         memset(f->sums, 0, sizeof(f->sums));
     const double *sums = f->sums;
-    const int err = known ? 0 : parallel_sum(f->s->n_threads, f->w->n, 4, add_witnesses, f, 1 + DISNEY_N + THETA_PACKED, f->sums);
+    const int err = known ? 0 : parallel_sum(f->s->n_threads, f->w->n, 4, add_witnesses, f, N_SHARED, f->sums);
     f->known = !err;
     *cost = sums[0];
     for (int p = 0; p < DISNEY_N; p++) {
         const double d = x[p] - (double)plain[p];
-        *cost += .5 * hold * d * d;
+        *cost += .5 * f->s->hold * d * d;
         if (!A)
             continue;
-        g[p] += sums[1 + p] + hold * d;
+        g[p] += sums[1 + p] + f->s->hold * d;
         for (int q = 0; q <= p; q++)
-            A[p * DISNEY_N + q] += sums[1 + DISNEY_N + packed_at(p, q)] + (p == q ? hold : 0);
+            A[p * DISNEY_N + q] += sums[1 + DISNEY_N + packed_at(p, q)] + (p == q ? f->s->hold : 0);
     }
     return err;
 }
@@ -372,7 +376,9 @@ static int deal_out(struct search *s)
         n++;
     }
     qsort(least, (size_t)n, sizeof(float), by_float);
-    deal(l, s->cost, s->out->n, n ? .5f * least[n / 2] : 0, s->region);
+    const double median = n ? (double)least[n / 2] : 0; // half the squares of a sample's three channels
+    s->hold = fmin(2 * median / 3 / plain_variance, first_hold);
+    deal(l, s->cost, s->out->n, .5f * (float)median, s->region);
     free(least);
     return 0;
 }
@@ -573,7 +579,7 @@ static int region_uncertainty(struct search *s, const struct texel_scene *scene,
         }
     }
     for (int p = 0; !err && p < DISNEY_N; p++) {
-        A[packed_at(p, p)] += hold;
+        A[packed_at(p, p)] += s->hold;
         for (int q = 0; q <= p; q++) {
             if ((frozen >> p & 1) || (frozen >> q & 1))
                 continue;
@@ -591,7 +597,7 @@ static int region_uncertainty(struct search *s, const struct texel_scene *scene,
     for (int p = 0; p < DISNEY_N; p++) {
         for (int q = 0; q < DISNEY_N && (frozen >> p & 1); q++)
             A[packed_at(p, q)] = p == q;
-        B[packed_at(p, p)] += frozen >> p & 1 ? 0 : .25 * hold * hold; // `hold` draws from a truth that is some .5 away
+        B[packed_at(p, p)] += frozen >> p & 1 ? 0 : plain_variance * s->hold * s->hold; // drawn from a truth that is so far away
     }
     double inverse[DISNEY_N][DISNEY_N] = { { 0 } };
     const bool regular = packed_factor(DISNEY_N, A);
@@ -612,8 +618,8 @@ static int region_uncertainty(struct search *s, const struct texel_scene *scene,
                     C[p][q] += inverse[p][a] * B[packed_at(a, b)] * inverse[b][q];
     for (int p = 0; p < DISNEY_N; p++) {
         // what the data do not say, or say no better than that it is a number in [0,1], has no standard deviation
-        const double said = regular && !(frozen >> p & 1) ? 1 - hold * inverse[p][p] : 0;
-        r->std[p] = said > .5 && C[p][p] < 1. / 12 ? (float)sqrt(C[p][p]) : INFINITY;
+        const double said = regular && !(frozen >> p & 1) ? 1 - s->hold * inverse[p][p] : 0;
+        r->std[p] = said > .5 && C[p][p] < plain_variance ? (float)sqrt(C[p][p]) : INFINITY;
         for (int q = 0; q <= p; q++)
             r->covariance[packed_at(p, q)] = C[p][q];
     }
@@ -751,7 +757,9 @@ static int choose_freedom(struct search *s, struct region *r, int at)
     double error2 = 0, std;
     uint16_t free_mask = 0, frozen = 0;
     call_witnesses(s, 1u << at, &w);
-    int err = fit_shared(s, &s->inner, &w, 0, false, r->theta);
+    struct shared_fit first = { .s = s, .scene = &s->inner, .w = &w };
+    double cost;
+    int err = w.n ? fit_from(&first, r->theta, 100, 1e-8, r->theta, &cost) : 0; // to the end: clearcoat against sheen is a long valley
     if (!err)
         err = simplify(s, &w, r, at, &frozen, &error2, &full);
     for (int p = 0; p < DISNEY_N; p++)
@@ -771,8 +779,7 @@ static int choose_freedom(struct search *s, struct region *r, int at)
     }
     r->aside_rmse_percent = 100 * sqrt(error2);
     struct shared_fit last = { .s = s, .scene = s->scene, .w = &w, .frozen = frozen };
-    double cost;
-    if (!err && w.n) // to the end: clearcoat against sheen is a long valley
+    if (!err && w.n)
         err = fit_from(&last, r->theta, 100, 1e-8, r->theta, &cost);
     if (!err)
         err = region_uncertainty(s, s->scene, &w, frozen, r, NULL);
@@ -830,7 +837,7 @@ static int search_new(struct search *s, const struct texel_scene *scene, const s
 int regions_find(struct regions *out, uint8_t *region_of, const struct texel_scene *scene, const struct level *level,
                  const float (*theta)[DISNEY_N], float (*albedo)[3], int n_threads)
 {
-    struct search s = { .albedo = albedo, .n_threads = n_threads, .region = region_of, .out = out };
+    struct search s = { .albedo = albedo, .n_threads = n_threads, .region = region_of, .out = out, .hold = first_hold };
     memset(out, 0, sizeof(*out));
     int err = search_new(&s, scene, level);
     if (!err)
