@@ -535,17 +535,47 @@ static int dissolve_small(struct search *s)
     return err;
 }
 
-// Covariance of a region's theta, albedos eliminated: A^-1 B A^-1 with B the sum of squared scores by view and by patch of the surface:
-// what the model lacks goes together there, and noise does not know it. leeway, or NULL: what share of the squared error theta takes up by
+// What a model lacks goes together in some way: in a view (exposure, camera), in a patch of the surface (shape), in views as oblique
+// (footprints near the outline), in normals and mirrored views alike (lights). The scores, J^T residual, are summed over each such group.
+enum { BY_VIEW, BY_PATCH, BY_SLANT, BY_NORMAL, BY_MIRROR, N_WAYS, N_SLANTS = 8 };
+
+static int octant_of(const float d[3])
+{
+    return (d[0] > 0) | (d[1] > 0) << 1 | (d[2] > 0) << 2;
+}
+
+static void groups_of(const struct texel_scene *scene, int texel, int view, int patch, int group[N_WAYS])
+{
+    const float *n = scene->texels->normal[texel];
+    float v[3], mirrored[3];
+    samples_view_direction(scene->samples, scene->texels, texel, view, v);
+    const float nv = n[0] * v[0] + n[1] * v[1] + n[2] * v[2];
+    for (int c = 0; c < 3; c++)
+        mirrored[c] = 2 * nv * n[c] - v[c];
+    group[BY_VIEW] = view, group[BY_PATCH] = patch;
+    group[BY_SLANT] = (int)fminf(fmaxf(nv * N_SLANTS, 0), N_SLANTS - 1);
+    group[BY_NORMAL] = octant_of(n), group[BY_MIRROR] = octant_of(mirrored);
+}
+
+// B += sign * the sum of g g^T.
+static void add_squares(double B[THETA_PACKED], const double g[DISNEY_N], double sign)
+{
+    for (int p = 0; p < DISNEY_N; p++)
+        for (int q = 0; q <= p; q++)
+            B[packed_at(p, q)] += sign * g[p] * g[q];
+}
+
+// Covariance of a region's theta, albedos eliminated: A^-1 B A^-1 with B the squared scores of samples, and what they are more than that
+// when summed over the groups of each way (Cameron, Gelbach, Miller 2011). leeway, or NULL: what share of the squared error theta takes up by
 // fitting such things, tr(A^-1 B) of the sum of squares (Takeuchi 1976).
 static int region_uncertainty(struct search *s, const struct texel_scene *scene, const struct witnesses *w, uint16_t frozen, struct region *r,
                               double *leeway)
 {
-    double squares = 0, A[THETA_PACKED] = { 0 }, B[THETA_PACKED] = { 0 }, C[DISNEY_N][DISNEY_N] = { { 0 } };
-    const int n_views = s->scene->samples->n_views;
-    double(*by_view)[DISNEY_N] = calloc((size_t)n_views + 1, sizeof(*by_view)), (*by_patch)[DISNEY_N] = calloc(PATCHES, sizeof(*by_patch));
+    double squares = 0, A[THETA_PACKED] = { 0 }, B[THETA_PACKED] = { 0 }, B_samples[THETA_PACKED] = { 0 }, C[DISNEY_N][DISNEY_N] = { { 0 } };
+    const int n_views = s->scene->samples->n_views, n_groups = n_views > PATCHES ? n_views : PATCHES;
+    double(*score)[DISNEY_N] = calloc((size_t)n_groups * N_WAYS, sizeof(*score));
     double(*J)[DISNEY_N] = malloc(3 * TEXEL_VIEWS_MAX * sizeof(*J));
-    int err = by_view && by_patch && J ? 0 : -ENOMEM;
+    int err = score && J ? 0 : -ENOMEM;
     for (int k = 0; !err && k < w->n; k++) {
         const struct texel_row *rows;
         struct texel_sums sums = { 0 };
@@ -563,34 +593,35 @@ static int region_uncertainty(struct search *s, const struct texel_scene *scene,
             continue;
         for (int p = 0; p < DISNEY_N; p++)
             packed_solve(3, own, mixed[p]);
+        double of_sample[DISNEY_N] = { 0 };
         for (int i = 0; i < n; i++) {
-            const int patch = (int)((int64_t)k * PATCHES / w->n);
+            int group[N_WAYS];
+            groups_of(scene, w->texel[k], rows[i].view, (int)((int64_t)k * PATCHES / w->n), group);
             squares += (double)rows[i].residual * (double)rows[i].residual;
             for (int p = 0; p < DISNEY_N; p++) {
                 J[i][p] = (double)rows[i].J[p];
                 for (int a = 0; a < 3; a++)
                     J[i][p] -= mixed[p][a] * (double)rows[i].J[DISNEY_N + a];
-                by_view[rows[i].view][p] += J[i][p] * (double)rows[i].residual;
-                by_patch[patch][p] += J[i][p] * (double)rows[i].residual;
+                const double g = frozen >> p & 1 ? 0 : J[i][p] * (double)rows[i].residual;
+                of_sample[p] += g;
+                for (int way = 0; way < N_WAYS; way++)
+                    score[way * n_groups + group[way]][p] += g;
             }
-            for (int p = 0; p < DISNEY_N; p++)
-                for (int q = 0; q <= p; q++)
-                    A[packed_at(p, q)] += J[i][p] * J[i][q];
+            if (i + 1 == n || rows[i + 1].view != rows[i].view) { // its three channels
+                add_squares(B_samples, of_sample, 1);
+                memset(of_sample, 0, sizeof(of_sample));
+            }
+            add_squares(A, J[i], 1);
         }
     }
-    for (int p = 0; !err && p < DISNEY_N; p++) {
+    for (int i = 0; !err && i < n_groups * N_WAYS; i++)
+        add_squares(B, score[i], 1);
+    for (int p = 0; p < THETA_PACKED; p++)
+        B[p] -= (N_WAYS - 1) * B_samples[p];
+    for (int p = 0; p < DISNEY_N; p++) {
         A[packed_at(p, p)] += s->hold;
-        for (int q = 0; q <= p; q++) {
-            if ((frozen >> p & 1) || (frozen >> q & 1))
-                continue;
-            for (int v = 0; v < n_views; v++)
-                B[packed_at(p, q)] += by_view[v][p] * by_view[v][q];
-            for (int v = 0; v < PATCHES; v++)
-                B[packed_at(p, q)] += by_patch[v][p] * by_patch[v][q];
-        }
     }
-    free(by_view);
-    free(by_patch);
+    free(score);
     free(J);
     if (err)
         return err;
@@ -605,7 +636,7 @@ static int region_uncertainty(struct search *s, const struct texel_scene *scene,
         inverse[p][p] = 1;
         packed_solve(DISNEY_N, A, inverse[p]);
     }
-    double taken = 0;
+    double taken = 0, least[DISNEY_N] = { 0 };
     for (int p = 0; p < DISNEY_N; p++)
         for (int q = 0; q < DISNEY_N; q++)
             taken += inverse[p][q] * B[packed_at(p, q)];
@@ -614,9 +645,12 @@ static int region_uncertainty(struct search *s, const struct texel_scene *scene,
     for (int p = 0; p < DISNEY_N; p++)
         for (int q = 0; q < DISNEY_N; q++)
             for (int a = 0; a < DISNEY_N; a++)
-                for (int b = 0; b < DISNEY_N; b++)
+                for (int b = 0; b < DISNEY_N; b++) {
                     C[p][q] += inverse[p][a] * B[packed_at(a, b)] * inverse[b][q];
+                    least[p] += p == q ? inverse[p][a] * B_samples[packed_at(a, b)] * inverse[b][q] : 0;
+                }
     for (int p = 0; p < DISNEY_N; p++) {
+        C[p][p] = fmax(C[p][p], least[p]); // a difference of squares may be anything
         // what the data do not say, or say no better than that it is a number in [0,1], has no standard deviation
         const double said = regular && !(frozen >> p & 1) ? 1 - s->hold * inverse[p][p] : 0;
         r->std[p] = said > .5 && C[p][p] < plain_variance ? (float)sqrt(C[p][p]) : INFINITY;
