@@ -565,6 +565,8 @@ static int fill_unobserved(const struct estimate *e, struct materials *m)
 struct judging {
     struct estimate *e;
     struct materials *m;
+    const struct materials_input *in;
+    const float *inverse_distance_std; // [lights n] or NULL: known
     double error2; // squared residual of a channel, mean over all: where a texel knows too little of its own
 };
 
@@ -582,6 +584,41 @@ static void measure_texels(void *arg, int64_t begin, int64_t end, int worker, do
         partial[0] += fit.squares, partial[1] += (double)fit.n;
         partial[2] += all.squares - fit.squares, partial[3] += (double)(all.n - fit.n);
     }
+}
+
+// What is not known of the lights, as a standard deviation of the log of a texel's light. Irradiance of light i goes as <n,w> <w,d> / |w|^4,
+// w = d + (c - p) / r its direction from p. Distances err together (E_sim leaves smooth errors), the centre along three axes.
+static double light_doubt(const struct judging *j, int texel)
+{
+    const struct texel_scene *s = &j->e->scene;
+    const struct light_arrays *l = &s->lights;
+    const float *p = s->texels->position_m[texel], *n = s->texels->normal[texel];
+    const uint16_t *visible = s->visible ? s->visible + (size_t)texel * (size_t)s->words_per_texel : NULL;
+    double E = 0, of_distances = 0, of_centre[3] = { 0 }, variance = 0;
+    if (!j->inverse_distance_std)
+        return 0;
+    for (int i = 0; i < l->n; i++) {
+        const float d[3] = { l->dx[i], l->dy[i], l->dz[i] };
+        float w[3], w2 = 0, wd = 0, nw = 0;
+        for (int c = 0; c < 3; c++) {
+            w[c] = d[c] + (l->centre_m[c] - p[c]) * l->q[i];
+            w2 += w[c] * w[c], wd += w[c] * d[c], nw += n[c] * w[c];
+        }
+        if (nw <= 0 || wd <= 0 || (visible && !(visible[i / 16] >> i % 16 & 1)))
+            continue;
+        const float here = (l->cr[i] + l->cg[i] + l->cb[i]) * nw * wd / (w2 * w2);
+        float along = 0;
+        for (int c = 0; c < 3; c++) {
+            const float slope = n[c] / nw + d[c] / wd - 4 * w[c] / w2; // d log E_i / d w_c
+            along += slope * (l->centre_m[c] - p[c]);
+            of_centre[c] += (double)(here * slope * l->q[i]);
+        }
+        E += (double)here;
+        of_distances += (double)(here * fabsf(along) * j->inverse_distance_std[i]);
+    }
+    for (int c = 0; c < 3; c++)
+        variance += of_centre[c] * of_centre[c] * j->in->centre_std_m[c] * j->in->centre_std_m[c];
+    return E > 0 ? sqrt(variance + of_distances * of_distances) / E : 0;
 }
 
 static void doubt_texels(void *arg, int64_t begin, int64_t end, int worker, double *partial)
@@ -640,18 +677,40 @@ static void doubt_texels(void *arg, int64_t begin, int64_t end, int worker, doub
                 m->std[t][p] = r && !is_free[p] ? r->std[p] : INFINITY;
             continue;
         }
+        const double of_light = light_doubt(j, t);
         for (int p = 0; p < n; p++) {
             double x[DISNEY_N + 3] = { 0 };
             x[p] = 1;
             packed_solve(n, A, x);
-            m->std[t][p] = is_free[p] ? (float)sqrt(error2 * x[p] + (p < DISNEY_N ? 0 : of_region[p - DISNEY_N])) : r->std[p];
+            const double of_lights = p < DISNEY_N ? 0 : of_light * (double)m->albedo[t][p - DISNEY_N];
+            m->std[t][p] = is_free[p] ? (float)sqrt(error2 * x[p] + (p < DISNEY_N ? 0 : of_region[p - DISNEY_N]) + of_lights * of_lights) : r->std[p];
         }
     }
 }
 
-static int judge(struct estimate *e, struct materials *m)
+// Every light's own deviation from that of its distance. NULL: known, or no memory.
+static float *light_stds(const struct materials_input *in)
 {
-    struct judging j = { .e = e, .m = m };
+    const int n = in->lights->n;
+    float *std = in->inverse_distance_std ? malloc(((size_t)n + 1) * sizeof(*std)) : NULL;
+    int32_t *distance_of = std ? malloc(((size_t)n + 1) * sizeof(*distance_of)) : NULL;
+    if (distance_of)
+        lights_number_distances(in->lights, distance_of);
+    for (int i = 0; distance_of && i < n; i++) {
+        const double own = in->inverse_distance_std[distance_of[i]];
+        std[i] = isfinite(own) ? (float)own : 0; // a light without irradiance
+    }
+    if (!distance_of) {
+        free(std);
+        return NULL;
+    }
+    free(distance_of);
+    return std;
+}
+
+static int judge(struct estimate *e, const struct materials_input *in, struct materials *m)
+{
+    struct judging j = { .e = e, .m = m, .in = in };
     double sums[4] = { 0 };
     e->scene.robust_scale = 0;
     int err = parallel_sum(e->set->n_threads, m->n_texels, EVALUATE_CHUNK, measure_texels, &j, 4, sums);
@@ -659,8 +718,13 @@ static int judge(struct estimate *e, struct materials *m)
     m->rmse_fit_percent = 100 * sqrt(sums[0] / fmax(3 * sums[1], 1));
     m->rmse_held_out_percent = sums[3] > 0 ? 100 * sqrt(sums[2] / (3 * sums[3])) : -1;
     j.error2 = sums[0] / fmax(3 * sums[1], 1);
+    float *stds = light_stds(in);
+    j.inverse_distance_std = stds;
+    if (in->inverse_distance_std && !stds)
+        err = -ENOMEM;
     if (!err)
         err = parallel_sum(e->set->n_threads, m->n_texels, EVALUATE_CHUNK, doubt_texels, &j, 1, sums);
+    free(stds);
     return err ? err : fill_unobserved(e, m);
 }
 
@@ -826,7 +890,7 @@ int materials_solve(struct materials *out, const struct materials_input *in, con
     }
     if (!err && !set->look) {
         m.std = malloc(n * sizeof(*m.std)), m.validity = calloc(n, 1), m.coverage = calloc(n, sizeof(*m.coverage));
-        err = m.std && m.validity && m.coverage ? judge(&e, &m) : -ENOMEM;
+        err = m.std && m.validity && m.coverage ? judge(&e, in, &m) : -ENOMEM;
         if (!err)
             check_energy(&e, &m);
     }
