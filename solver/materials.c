@@ -19,10 +19,12 @@ enum {
     SELECT_SIZE = 64,      // regions are found on the finest level no larger
     EVALUATE_CHUNK = 32, ROW_CHUNK = 2048,
     WEAK_SAMPLES = 8,
+    ALL_TIED = (1 << DISNEY_N) - 1,
     BOUNCE_RAYS = 64, BOUNCE_LOOKS = 3, // rays per texel; how often the albedo is found and light sent out again
 };
 static const double first_mu = 1e-3, least_mu = 1e-7, most_mu = 1e9;
 static const float settled = 5e-4f; // a smaller step is not worth looking at the samples again
+static const double light_settled = 3e-4; // of white: what half floats and look-ups leave in any comparison
 
 struct materials_settings materials_defaults(void)
 {
@@ -128,9 +130,10 @@ static void evaluate(void *arg, int64_t begin, int64_t end, int worker, double *
         int n_delegates = l->first_delegate ? l->first_delegate[i + 1] - l->first_delegate[i] : 1;
         if (n_delegates > DELEGATES_MAX)
             n_delegates = DELEGATES_MAX;
+        const bool moves = tied_of(t, i) != ALL_TIED;
         for (int d = 0; d < n_delegates; d++) {
             memcpy(albedo[d], e->albedo[delegate[d]], sizeof(albedo[d]));
-            texel_fit(&e->scene, e->worker[worker], delegate[d], l->first_delegate ? DELEGATE_VIEWS : 0, theta, albedo[d],
+            (moves ? texel_fit : texel_fit_albedo)(&e->scene, e->worker[worker], delegate[d], l->first_delegate ? DELEGATE_VIEWS : 0, theta, albedo[d],
                       t->scale ? t->scale[i] : 1, &sums);
         }
         partial[1] += sums.distance, partial[2] += sums.n, partial[3] += sums.n;
@@ -202,7 +205,7 @@ static void assemble(void *arg, int64_t begin, int64_t end, int worker)
             memset(M, 0, sizeof(M));
             for (int p = 0; p < DISNEY_N; p++)
                 M[packed_at(p, p)] = 1;
-            t->frozen[k] = (1 << DISNEY_N) - 1;
+            t->frozen[k] = ALL_TIED;
             t->mu[k] *= 10;
         }
         for (int p = 0; p < THETA_PACKED; p++)
@@ -385,6 +388,15 @@ static int solve_tile(struct tile *t, int most_iterations, struct materials_leve
     return err;
 }
 
+static bool any_free(const struct regions *r)
+{
+    for (int k = 0; r && k < r->n; k++)
+        for (int p = 0; p < DISNEY_N; p++)
+            if (r->region[k].freedom[p] == PARAMETER_FREE)
+                return true;
+    return !r || !r->n;
+}
+
 // theta[level n] in and out. scale[level n] or NULL.
 static int solve_level(struct estimate *e, int k, float (*theta)[DISNEY_N], const float (*parent_theta)[DISNEY_N],
                        const uint8_t *region, const double *scale, struct materials_level *report)
@@ -398,6 +410,8 @@ static int solve_level(struct estimate *e, int k, float (*theta)[DISNEY_N], cons
         for (int p = 0; p < DISNEY_N; p++)
             if (e->regions->region[region[i]].freedom[p] != PARAMETER_FREE)
                 theta[i][p] = e->regions->region[region[i]].theta[p];
+    if (!finest && !any_free(region ? e->regions : NULL))
+        return 0; // what is left to find is the albedo, and that is the finest texels'
     for (int begin = 0; !err && begin < l->n; begin += TILE_TEXELS) {
         struct tile t = { .e = e, .level = l, .begin = begin, .n = l->n - begin < TILE_TEXELS ? l->n - begin : TILE_TEXELS, .finest = finest,
                           .theta = theta, .parent_theta = parent_theta, .region = region, .scale = scale,
@@ -551,6 +565,8 @@ static int fill_unobserved(const struct estimate *e, struct materials *m)
 struct judging {
     struct estimate *e;
     struct materials *m;
+    const struct materials_input *in;
+    const float *inverse_distance_std; // [lights n] or NULL: known
     double error2; // squared residual of a channel, mean over all: where a texel knows too little of its own
 };
 
@@ -568,6 +584,41 @@ static void measure_texels(void *arg, int64_t begin, int64_t end, int worker, do
         partial[0] += fit.squares, partial[1] += (double)fit.n;
         partial[2] += all.squares - fit.squares, partial[3] += (double)(all.n - fit.n);
     }
+}
+
+// What is not known of the lights, as a standard deviation of the log of a texel's light. Irradiance of light i goes as <n,w> <w,d> / |w|^4,
+// w = d + (c - p) / r its direction from p. Distances err together (E_sim leaves smooth errors), the centre along three axes.
+static double light_doubt(const struct judging *j, int texel)
+{
+    const struct texel_scene *s = &j->e->scene;
+    const struct light_arrays *l = &s->lights;
+    const float *p = s->texels->position_m[texel], *n = s->texels->normal[texel];
+    const uint16_t *visible = s->visible ? s->visible + (size_t)texel * (size_t)s->words_per_texel : NULL;
+    double E = 0, of_distances = 0, of_centre[3] = { 0 }, variance = 0;
+    if (!j->inverse_distance_std)
+        return 0;
+    for (int i = 0; i < l->n; i++) {
+        const float d[3] = { l->dx[i], l->dy[i], l->dz[i] };
+        float w[3], w2 = 0, wd = 0, nw = 0;
+        for (int c = 0; c < 3; c++) {
+            w[c] = d[c] + (l->centre_m[c] - p[c]) * l->q[i];
+            w2 += w[c] * w[c], wd += w[c] * d[c], nw += n[c] * w[c];
+        }
+        if (nw <= 0 || wd <= 0 || (visible && !(visible[i / 16] >> i % 16 & 1)))
+            continue;
+        const float here = (l->cr[i] + l->cg[i] + l->cb[i]) * nw * wd / (w2 * w2);
+        float along = 0;
+        for (int c = 0; c < 3; c++) {
+            const float slope = n[c] / nw + d[c] / wd - 4 * w[c] / w2; // d log E_i / d w_c
+            along += slope * (l->centre_m[c] - p[c]);
+            of_centre[c] += (double)(here * slope * l->q[i]);
+        }
+        E += (double)here;
+        of_distances += (double)(here * fabsf(along) * j->inverse_distance_std[i]);
+    }
+    for (int c = 0; c < 3; c++)
+        variance += of_centre[c] * of_centre[c] * j->in->centre_std_m[c] * j->in->centre_std_m[c];
+    return E > 0 ? sqrt(variance + of_distances * of_distances) / E : 0;
 }
 
 static void doubt_texels(void *arg, int64_t begin, int64_t end, int worker, double *partial)
@@ -626,18 +677,40 @@ static void doubt_texels(void *arg, int64_t begin, int64_t end, int worker, doub
                 m->std[t][p] = r && !is_free[p] ? r->std[p] : INFINITY;
             continue;
         }
+        const double of_light = light_doubt(j, t);
         for (int p = 0; p < n; p++) {
             double x[DISNEY_N + 3] = { 0 };
             x[p] = 1;
             packed_solve(n, A, x);
-            m->std[t][p] = is_free[p] ? (float)sqrt(error2 * x[p] + (p < DISNEY_N ? 0 : of_region[p - DISNEY_N])) : r->std[p];
+            const double of_lights = p < DISNEY_N ? 0 : of_light * (double)m->albedo[t][p - DISNEY_N];
+            m->std[t][p] = is_free[p] ? (float)sqrt(error2 * x[p] + (p < DISNEY_N ? 0 : of_region[p - DISNEY_N]) + of_lights * of_lights) : r->std[p];
         }
     }
 }
 
-static int judge(struct estimate *e, struct materials *m)
+// Every light's own deviation from that of its distance. NULL: known, or no memory.
+static float *light_stds(const struct materials_input *in)
 {
-    struct judging j = { .e = e, .m = m };
+    const int n = in->lights->n;
+    float *std = in->inverse_distance_std ? malloc(((size_t)n + 1) * sizeof(*std)) : NULL;
+    int32_t *distance_of = std ? malloc(((size_t)n + 1) * sizeof(*distance_of)) : NULL;
+    if (distance_of)
+        lights_number_distances(in->lights, distance_of);
+    for (int i = 0; distance_of && i < n; i++) {
+        const double own = in->inverse_distance_std[distance_of[i]];
+        std[i] = isfinite(own) ? (float)own : 0; // a light without irradiance
+    }
+    if (!distance_of) {
+        free(std);
+        return NULL;
+    }
+    free(distance_of);
+    return std;
+}
+
+static int judge(struct estimate *e, const struct materials_input *in, struct materials *m)
+{
+    struct judging j = { .e = e, .m = m, .in = in };
     double sums[4] = { 0 };
     e->scene.robust_scale = 0;
     int err = parallel_sum(e->set->n_threads, m->n_texels, EVALUATE_CHUNK, measure_texels, &j, 4, sums);
@@ -645,8 +718,13 @@ static int judge(struct estimate *e, struct materials *m)
     m->rmse_fit_percent = 100 * sqrt(sums[0] / fmax(3 * sums[1], 1));
     m->rmse_held_out_percent = sums[3] > 0 ? 100 * sqrt(sums[2] / (3 * sums[3])) : -1;
     j.error2 = sums[0] / fmax(3 * sums[1], 1);
+    float *stds = light_stds(in);
+    j.inverse_distance_std = stds;
+    if (in->inverse_distance_std && !stds)
+        err = -ENOMEM;
     if (!err)
         err = parallel_sum(e->set->n_threads, m->n_texels, EVALUATE_CHUNK, doubt_texels, &j, 1, sums);
+    free(stds);
     return err ? err : fill_unobserved(e, m);
 }
 
@@ -724,12 +802,18 @@ static void fit_albedos(void *arg, int64_t begin, int64_t end, int worker)
     }
 }
 
-static int bounce(struct estimate *e, const struct materials_input *in, struct materials *m, float (*indirect)[3])
+// *settled_now: the pictures would not know this light from that before.
+static int bounce(struct estimate *e, const struct materials_input *in, struct materials *m, float (*indirect)[3], bool *settled_now)
 {
     struct judging j = { .e = e, .m = m };
-    float(*diffuse)[3] = malloc(((size_t)m->n_texels + 1) * sizeof(*diffuse));
-    if (!diffuse)
+    const size_t n = (size_t)m->n_texels;
+    double change2 = 0;
+    float(*diffuse)[3] = malloc((n + 1) * sizeof(*diffuse)), (*before)[3] = malloc((n + 1) * sizeof(*before));
+    if (!diffuse || !before) {
+        free(diffuse);
+        free(before);
         return -ENOMEM;
+    }
     const struct interreflection light = { .texels = in->texels, .mesh = in->mesh, .rays = in->rays, .lights = &e->scene.lights, .kernels = e->scene.kernels,
                                            .visible = in->visible, .words_per_texel = in->words_per_texel, .diffuse = (const float(*)[3])diffuse,
                                            .n_rays = BOUNCE_RAYS, .n_threads = e->set->n_threads };
@@ -738,10 +822,18 @@ static int bounce(struct estimate *e, const struct materials_input *in, struct m
     for (int t = 0; t < m->n_texels; t++)
         for (int c = 0; c < 3; c++)
             diffuse[t][c] = e->albedo[t][c] * (1 - m->theta[t][DISNEY_METALLIC]);
-    memset(indirect, 0, (size_t)m->n_texels * sizeof(*indirect));
+    memcpy(before, indirect, n * sizeof(*before));
+    memset(indirect, 0, n * sizeof(*indirect));
     for (int k = 0; !err && k < e->set->n_bounces; k++)
         err = interreflection_gather(&light, indirect);
+    for (size_t t = 0; t < n; t++)
+        for (int c = 0; c < 3; c++) {
+            const double change = (double)(e->albedo[t][c] * (indirect[t][c] - before[t][c])) / M_PI;
+            change2 += change * change;
+        }
+    *settled_now = change2 < light_settled * light_settled * 3 * (double)n;
     free(diffuse);
+    free(before);
     return err;
 }
 
@@ -757,6 +849,7 @@ int materials_solve(struct materials *out, const struct materials_input *in, con
     struct estimate e;
     struct materials m = { .n_texels = in->texels->n, .rmse_held_out_percent = -1 };
     struct materials_settings look = *set;
+    bool whole = false;
     const size_t n = (size_t)m.n_texels + 1;
     memset(out, 0, sizeof(*out));
     int err = estimate_new(&e, in, set);
@@ -771,20 +864,25 @@ int materials_solve(struct materials *out, const struct materials_input *in, con
         float(*indirect)[3] = calloc(n, sizeof(*indirect));
         err = indirect ? 0 : -ENOMEM;
         look.most_size = set->most_size && set->most_size < SELECT_SIZE ? set->most_size : SELECT_SIZE;
+        bool settled_now = false;
         e.set = &look;
-        for (int k = 0; !err && k < BOUNCE_LOOKS; k++) {
+        for (int k = 0; !err && k < BOUNCE_LOOKS && !settled_now; k++) {
             err = pyramid(&e, in, &m);
             if (!err)
-                err = bounce(&e, in, &m, indirect);
+                err = bounce(&e, in, &m, indirect, &settled_now);
+            if (!err && settled_now && look.most_size >= in->texels->size)
+                whole = true; // the last look was all there is to see
             e.scene.indirect = (const float(*)[3])indirect; // freed with the estimate
-            e.regions = NULL;
-            clear_look(&m);
+            if (!whole) {
+                e.regions = NULL;
+                clear_look(&m);
+            }
         }
         if (!e.scene.indirect)
             free(indirect);
         e.set = set;
     }
-    if (!err)
+    if (!err && !whole)
         err = pyramid(&e, in, &m);
     if (!err && set->most_size && set->most_size < in->texels->size && set->free_albedo) {
         struct judging j = { .e = &e, .m = &m };
@@ -792,7 +890,7 @@ int materials_solve(struct materials *out, const struct materials_input *in, con
     }
     if (!err && !set->look) {
         m.std = malloc(n * sizeof(*m.std)), m.validity = calloc(n, 1), m.coverage = calloc(n, sizeof(*m.coverage));
-        err = m.std && m.validity && m.coverage ? judge(&e, &m) : -ENOMEM;
+        err = m.std && m.validity && m.coverage ? judge(&e, in, &m) : -ENOMEM;
         if (!err)
             check_energy(&e, &m);
     }

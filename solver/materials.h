@@ -39,6 +39,8 @@ struct materials_input {
     const uint16_t *visible;        // [n_texels][words_per_texel], or NULL
     int words_per_texel;
     const double *log_gain;         // [n_views], or NULL
+    const double *inverse_distance_std; // [distances of the lights: lights_number_distances] 1/m, and of the centre: what stage 1 does not
+    double centre_std_m[3];         // know of the lights is not known of the albedo either; or NULL, 0: they are known
     const uint8_t *hold_out;        // [n_views] 1: never fitted, only reported; or NULL
     const struct rays *rays;        // for n_bounces; else NULL
     const struct mesh *mesh;

@@ -15,6 +15,7 @@ const char *const parameter_freedom_names[3] = { "frozen", "tied", "free" };
 enum {
     FIRST_REGIONS = 6,    // cut into so many before merging
     WITNESSES = 192,      // texels a region is fitted to
+    EXPLORERS = 48,       // of them, where many places are tried
     DEAL_ROUNDS = 3,
     PATCHES = 64,         // of the surface: within one, errors of the model go together
     MOST_VIEWS = 2048,
@@ -25,9 +26,10 @@ static const double worth_a_parameter = .97; // the same with a parameter free p
 static const double worth_a_layer = 1.01;    // the same without clearcoat, sheen, ...
 static const double better_without = .99;
 static const double rounding2 = 3e-4 * 3e-4; // what half floats and look-ups leave in any comparison: to gain less is to gain nothing
-static const float unknown_misfit = 1.5f; // errors that neither views nor patches show: measured on D3 (90 % intervals over seeds)
+static const float unknown_misfit = 1.75f; // errors that go together in none of the ways looked at: measured on D3 (90 % intervals over seeds, coverage.sh)
 static const double most_free_std = .15;
-static const double hold = 1e-3;             // draws what nothing determines towards where it started, beside the sum of squares
+static const double first_hold = 1e-3;       // until the pictures' error is known
+static const double plain_variance = 1. / 12; // a parameter is somewhere in [0,1] before any picture
 static const double own_hold = .02;          // the same of one texel's own parameter
 
 // What a parameter is when nothing speaks for it.
@@ -43,6 +45,7 @@ struct search {
     int n_workers, n_threads;
     uint8_t *region;                     // [level n]
     float *cost;                         // [level n][REGIONS_MAX]
+    double hold;                         // draws what nothing determines towards plain, beside the sum of squares
     struct regions *out;
 };
 
@@ -83,12 +86,16 @@ static void call_witnesses(const struct search *s, unsigned mask, struct witness
 
 // ---- one reflectance for many texels ------------------------------------------------------------------------------------
 
+enum { N_SHARED = 1 + DISNEY_N + THETA_PACKED };
+
 struct shared_fit {
     struct search *s;
     const struct texel_scene *scene;
     const struct witnesses *w;
     uint16_t frozen;         // parameters that stay plain
     float theta[DISNEY_N];
+    double sums[N_SHARED];   // at theta: cost, g, H
+    bool known;
 };
 
 static void add_witnesses(void *arg, int64_t begin, int64_t end, int worker, double *partial)
@@ -108,19 +115,25 @@ static void add_witnesses(void *arg, int64_t begin, int64_t end, int worker, dou
 static int shared_equations(void *arg, const double *x, double *cost, double *A, double *g)
 {
     struct shared_fit *f = arg;
-    double sums[1 + DISNEY_N + THETA_PACKED] = { 0 };
-    for (int p = 0; p < DISNEY_N; p++)
+    bool known = f->known; // a step that is taken was just looked at
+    for (int p = 0; p < DISNEY_N; p++) {
+        known = known && f->theta[p] == (float)x[p];
         f->theta[p] = (float)x[p];
-    const int err = parallel_sum(f->s->n_threads, f->w->n, 4, add_witnesses, f, 1 + DISNEY_N + THETA_PACKED, sums);
+    }
+    if (!known)
+        memset(f->sums, 0, sizeof(f->sums));
+    const double *sums = f->sums;
+    const int err = known ? 0 : parallel_sum(f->s->n_threads, f->w->n, 4, add_witnesses, f, N_SHARED, f->sums);
+    f->known = !err;
     *cost = sums[0];
     for (int p = 0; p < DISNEY_N; p++) {
         const double d = x[p] - (double)plain[p];
-        *cost += .5 * hold * d * d;
+        *cost += .5 * f->s->hold * d * d;
         if (!A)
             continue;
-        g[p] += sums[1 + p] + hold * d;
+        g[p] += sums[1 + p] + f->s->hold * d;
         for (int q = 0; q <= p; q++)
-            A[p * DISNEY_N + q] += sums[1 + DISNEY_N + packed_at(p, q)] + (p == q ? hold : 0);
+            A[p * DISNEY_N + q] += sums[1 + DISNEY_N + packed_at(p, q)] + (p == q ? f->s->hold : 0);
     }
     return err;
 }
@@ -157,11 +170,14 @@ static int fit_shared(struct search *s, const struct texel_scene *scene, const s
                       float theta[DISNEY_N])
 {
     static const float starts[][2] = { { 0, .15f }, { 0, .35f }, { 0, .7f }, { 1, .2f }, { 1, .45f } }; // metallic, roughness
-    struct shared_fit f = { .s = s, .scene = scene, .w = w, .frozen = frozen };
+    struct witnesses some = { 0 }; // are enough to choose a place
+    struct shared_fit f = { .s = s, .scene = scene, .w = anywhere ? &some : w, .frozen = frozen };
     float best[DISNEY_N];
     double least;
     if (!w->n)
         return 0;
+    for (int k = 0; k < EXPLORERS && k < w->n; k++)
+        some.texel[some.n++] = w->texel[(int64_t)k * w->n / (w->n < EXPLORERS ? w->n : EXPLORERS)];
     int err = fit_from(&f, theta, anywhere ? 8 : 30, 1e-5, best, &least);
     for (size_t k = 0; !err && anywhere && k < sizeof(starts) / sizeof(*starts); k++) {
         float from[DISNEY_N], to[DISNEY_N];
@@ -174,6 +190,7 @@ static int fit_shared(struct search *s, const struct texel_scene *scene, const s
             memcpy(best, to, sizeof(best));
         }
     }
+    f.w = w, f.known = false;
     if (!err && anywhere)
         err = fit_from(&f, best, 30, 1e-5, best, &least);
     if (!err)
@@ -263,7 +280,7 @@ static void test_witnesses(void *arg, int64_t begin, int64_t end, int worker, do
         if (t->free_mask)
             fit_own(t, t->s->worker[worker], k, theta, albedo);
         else
-            texel_fit(&t->s->inner, t->s->worker[worker], t->w->texel[k], 0, theta, albedo, 1, &sums);
+            texel_fit_albedo(&t->s->inner, t->s->worker[worker], t->w->texel[k], 0, theta, albedo, 1, &sums);
         texel_measure(&t->s->aside, t->s->worker[worker], t->w->texel[k], theta, albedo, &error);
         t->error2[k] = error.n ? (float)(error.squares / (3 * (double)error.n)) : 0;
         partial[0] += error.squares, partial[1] += 3 * (double)error.n;
@@ -305,7 +322,7 @@ static void cost_nodes(void *arg, int64_t begin, int64_t end, int worker)
             if (s->texel[i] < 0)
                 continue;
             memcpy(albedo, s->albedo[s->texel[i]], sizeof(albedo));
-            texel_fit(s->scene, s->worker[worker], s->texel[i], 0, s->out->region[r].theta, albedo, 1, &sums);
+            texel_fit_albedo(s->scene, s->worker[worker], s->texel[i], 0, s->out->region[r].theta, albedo, 1, &sums);
             s->cost[i * REGIONS_MAX + r] = (float)(sums.cost / fmax(sums.n, 1));
         }
 }
@@ -359,7 +376,9 @@ static int deal_out(struct search *s)
         n++;
     }
     qsort(least, (size_t)n, sizeof(float), by_float);
-    deal(l, s->cost, s->out->n, n ? .5f * least[n / 2] : 0, s->region);
+    const double median = n ? (double)least[n / 2] : 0; // half the squares of a sample's three channels
+    s->hold = fmin(2 * median / 3 / plain_variance, first_hold);
+    deal(l, s->cost, s->out->n, .5f * (float)median, s->region);
     free(least);
     return 0;
 }
@@ -516,6 +535,131 @@ static int dissolve_small(struct search *s)
     return err;
 }
 
+// What a model lacks goes together in some way: in a view (exposure, camera), in a patch of the surface (shape), in views as oblique
+// (footprints near the outline), in normals and mirrored views alike (lights). The scores, J^T residual, are summed over each such group.
+enum { BY_VIEW, BY_PATCH, BY_SLANT, BY_NORMAL, BY_MIRROR, N_WAYS, N_SLANTS = 8 };
+
+static int octant_of(const float d[3])
+{
+    return (d[0] > 0) | (d[1] > 0) << 1 | (d[2] > 0) << 2;
+}
+
+static void groups_of(const struct texel_scene *scene, int texel, int view, int patch, int group[N_WAYS])
+{
+    const float *n = scene->texels->normal[texel];
+    float v[3], mirrored[3];
+    samples_view_direction(scene->samples, scene->texels, texel, view, v);
+    const float nv = n[0] * v[0] + n[1] * v[1] + n[2] * v[2];
+    for (int c = 0; c < 3; c++)
+        mirrored[c] = 2 * nv * n[c] - v[c];
+    group[BY_VIEW] = view, group[BY_PATCH] = patch;
+    group[BY_SLANT] = (int)fminf(fmaxf(nv * N_SLANTS, 0), N_SLANTS - 1);
+    group[BY_NORMAL] = octant_of(n), group[BY_MIRROR] = octant_of(mirrored);
+}
+
+// B += sign * the sum of g g^T.
+static void add_squares(double B[THETA_PACKED], const double g[DISNEY_N], double sign)
+{
+    for (int p = 0; p < DISNEY_N; p++)
+        for (int q = 0; q <= p; q++)
+            B[packed_at(p, q)] += sign * g[p] * g[q];
+}
+
+// Covariance of a region's theta, albedos eliminated: A^-1 B A^-1 with B the squared scores of samples, and what they are more than that
+// when summed over the groups of each way (Cameron, Gelbach, Miller 2011). leeway, or NULL: what share of the squared error theta takes up by
+// fitting such things, tr(A^-1 B) of the sum of squares (Takeuchi 1976).
+static int region_uncertainty(struct search *s, const struct texel_scene *scene, const struct witnesses *w, uint16_t frozen, struct region *r,
+                              double *leeway)
+{
+    double squares = 0, A[THETA_PACKED] = { 0 }, B[THETA_PACKED] = { 0 }, B_samples[THETA_PACKED] = { 0 }, C[DISNEY_N][DISNEY_N] = { { 0 } };
+    const int n_views = s->scene->samples->n_views, n_groups = n_views > PATCHES ? n_views : PATCHES;
+    double(*score)[DISNEY_N] = calloc((size_t)n_groups * N_WAYS, sizeof(*score));
+    double(*J)[DISNEY_N] = malloc(3 * TEXEL_VIEWS_MAX * sizeof(*J));
+    int err = score && J ? 0 : -ENOMEM;
+    for (int k = 0; !err && k < w->n; k++) {
+        const struct texel_row *rows;
+        struct texel_sums sums = { 0 };
+        texel_fit_albedo(scene, s->worker[0], w->texel[k], 0, r->theta, s->albedo[w->texel[k]], 1, &sums);
+        const int n = texel_rows(scene, s->worker[0], w->texel[k], r->theta, s->albedo[w->texel[k]], &rows);
+        double own[6] = { 1e-12, 0, 1e-12, 0, 0, 1e-12 }, mixed[DISNEY_N][3] = { { 0 } };
+        for (int i = 0; i < n; i++)
+            for (int a = 0; a < 3; a++) {
+                for (int b = 0; b <= a; b++)
+                    own[packed_at(a, b)] += (double)rows[i].J[DISNEY_N + a] * (double)rows[i].J[DISNEY_N + b];
+                for (int p = 0; p < DISNEY_N; p++)
+                    mixed[p][a] += (double)rows[i].J[DISNEY_N + a] * (double)rows[i].J[p];
+            }
+        if (!packed_factor(3, own))
+            continue;
+        for (int p = 0; p < DISNEY_N; p++)
+            packed_solve(3, own, mixed[p]);
+        double of_sample[DISNEY_N] = { 0 };
+        for (int i = 0; i < n; i++) {
+            int group[N_WAYS];
+            groups_of(scene, w->texel[k], rows[i].view, (int)((int64_t)k * PATCHES / w->n), group);
+            squares += (double)rows[i].residual * (double)rows[i].residual;
+            for (int p = 0; p < DISNEY_N; p++) {
+                J[i][p] = (double)rows[i].J[p];
+                for (int a = 0; a < 3; a++)
+                    J[i][p] -= mixed[p][a] * (double)rows[i].J[DISNEY_N + a];
+                const double g = frozen >> p & 1 ? 0 : J[i][p] * (double)rows[i].residual;
+                of_sample[p] += g;
+                for (int way = 0; way < N_WAYS; way++)
+                    score[way * n_groups + group[way]][p] += g;
+            }
+            if (i + 1 == n || rows[i + 1].view != rows[i].view) { // its three channels
+                add_squares(B_samples, of_sample, 1);
+                memset(of_sample, 0, sizeof(of_sample));
+            }
+            add_squares(A, J[i], 1);
+        }
+    }
+    for (int i = 0; !err && i < n_groups * N_WAYS; i++)
+        add_squares(B, score[i], 1);
+    for (int p = 0; p < THETA_PACKED; p++)
+        B[p] -= (N_WAYS - 1) * B_samples[p];
+    for (int p = 0; p < DISNEY_N; p++) {
+        A[packed_at(p, p)] += s->hold;
+    }
+    free(score);
+    free(J);
+    if (err)
+        return err;
+    for (int p = 0; p < DISNEY_N; p++) {
+        for (int q = 0; q < DISNEY_N && (frozen >> p & 1); q++)
+            A[packed_at(p, q)] = p == q;
+        B[packed_at(p, p)] += frozen >> p & 1 ? 0 : plain_variance * s->hold * s->hold; // drawn from a truth that is so far away
+    }
+    double inverse[DISNEY_N][DISNEY_N] = { { 0 } };
+    const bool regular = packed_factor(DISNEY_N, A);
+    for (int p = 0; regular && p < DISNEY_N; p++) {
+        inverse[p][p] = 1;
+        packed_solve(DISNEY_N, A, inverse[p]);
+    }
+    double taken = 0, least[DISNEY_N] = { 0 };
+    for (int p = 0; p < DISNEY_N; p++)
+        for (int q = 0; q < DISNEY_N; q++)
+            taken += inverse[p][q] * B[packed_at(p, q)];
+    if (leeway)
+        *leeway = regular && squares > 0 ? taken / squares : INFINITY;
+    for (int p = 0; p < DISNEY_N; p++)
+        for (int q = 0; q < DISNEY_N; q++)
+            for (int a = 0; a < DISNEY_N; a++)
+                for (int b = 0; b < DISNEY_N; b++) {
+                    C[p][q] += inverse[p][a] * B[packed_at(a, b)] * inverse[b][q];
+                    least[p] += p == q ? inverse[p][a] * B_samples[packed_at(a, b)] * inverse[b][q] : 0;
+                }
+    for (int p = 0; p < DISNEY_N; p++) {
+        C[p][p] = fmax(C[p][p], least[p]); // a difference of squares may be anything
+        // what the data do not say, or say no better than that it is a number in [0,1], has no standard deviation
+        const double said = regular && !(frozen >> p & 1) ? 1 - s->hold * inverse[p][p] : 0;
+        r->std[p] = said > .5 && C[p][p] < plain_variance ? (float)sqrt(C[p][p]) : INFINITY;
+        for (int q = 0; q <= p; q++)
+            r->covariance[packed_at(p, q)] = C[p][q];
+    }
+    return 0;
+}
+
 // By what factor the witnesses' errors grow from `alone` to `shared`: the mean over them of the logarithm, as texels are very unlike; and as
 // much less as could be chance (four standard errors).
 static double how_much_worse(const float *shared, const float *alone, int n)
@@ -531,29 +675,43 @@ static double how_much_worse(const float *shared, const float *alone, int n)
     return exp(mean - 4 * sqrt(variance));
 }
 
-// As long as two regions do as well under one reflectance, they are one.
+// As many of either.
+static void call_both(const struct witnesses *a, const struct witnesses *b, struct witnesses *both)
+{
+    both->n = 0;
+    for (int side = 0; side < 2; side++) {
+        const struct witnesses *w = side ? b : a;
+        const int n = w->n < WITNESSES / 2 ? w->n : WITNESSES / 2;
+        for (int k = 0; k < n; k++)
+            both->texel[both->n++] = w->texel[(int64_t)k * w->n / n];
+    }
+}
+
+// Two regions are one as long as both do as well under one reflectance: no worse than by a tenth of the squared error, or by what a
+// reflectance of their own takes up of anything. Where the lights are wrong every piece of the surface does better by itself, in views set
+// aside too, which share the lights' error; what is left of the pictures under a theta of its own says how much of that there is.
 static int merge(struct search *s)
 {
     int err = 0;
     while (!err && s->out->n > 1) {
-        double least = INFINITY, error2;
+        double least = INFINITY, error2, most_worse[REGIONS_MAX];
         float alone[REGIONS_MAX][WITNESSES];
         struct witnesses w[REGIONS_MAX];
         float best_theta[DISNEY_N];
-        int best_a = 0, best_b = 0;
+        int best_a = -1, best_b = -1;
         for (int r = 0; !err && r < s->out->n; r++) {
+            double leeway;
             call_witnesses(s, 1u << r, &w[r]);
             err = test(s, &w[r], s->out->region[r].theta, 0, -1, &error2, NULL, alone[r]);
+            if (!err)
+                err = region_uncertainty(s, &s->inner, &w[r], 0, &s->out->region[r], &leeway);
+            most_worse[r] = fmax(worth_a_region, 1 + leeway);
         }
         for (int a = 0; !err && a < s->out->n; a++)
             for (int b = a + 1; !err && b < s->out->n; b++) {
-                struct witnesses both = { 0 }; // as many of either
-                float theta[DISNEY_N];
-                float one[WITNESSES], other[WITNESSES];
-                for (int k = 0; k < WITNESSES / 2 && k < w[a].n; k++)
-                    both.texel[both.n++] = w[a].texel[(int64_t)k * w[a].n / (w[a].n < WITNESSES / 2 ? w[a].n : WITNESSES / 2)];
-                for (int k = 0; k < WITNESSES / 2 && k < w[b].n; k++)
-                    both.texel[both.n++] = w[b].texel[(int64_t)k * w[b].n / (w[b].n < WITNESSES / 2 ? w[b].n : WITNESSES / 2)];
+                struct witnesses both;
+                float theta[DISNEY_N], one[WITNESSES], other[WITNESSES];
+                call_both(&w[a], &w[b], &both);
                 for (int p = 0; p < DISNEY_N; p++)
                     theta[p] = .5f * (s->out->region[a].theta[p] + s->out->region[b].theta[p]);
                 err = fit_shared(s, &s->inner, &both, 0, false, theta);
@@ -561,17 +719,20 @@ static int merge(struct search *s)
                     err = test(s, &w[a], theta, 0, -1, &error2, NULL, one);
                 if (!err)
                     err = test(s, &w[b], theta, 0, -1, &error2, NULL, other);
-                const double ratio = err ? INFINITY : fmax(how_much_worse(one, alone[a], w[a].n), how_much_worse(other, alone[b], w[b].n));
-                if (!err && ratio < least) {
-                    least = ratio, best_a = a, best_b = b;
+                if (err)
+                    break;
+                const double worse_a = how_much_worse(one, alone[a], w[a].n), worse_b = how_much_worse(other, alone[b], w[b].n);
+                const double worse = fmax(worse_a / most_worse[a], worse_b / most_worse[b]);
+                log_debug("regions: %d and %d of %d as one: views aside %.4f x, %.4f x; allowed %.4f, %.4f", a, b, s->out->n, worse_a, worse_b,
+                          most_worse[a], most_worse[b]);
+                if (worse < least) {
+                    least = worse, best_a = a, best_b = b;
                     memcpy(best_theta, theta, sizeof(theta));
                 }
             }
-        if (!err && least > worth_a_region)
-            log_debug("regions: %d and %d of %d stay apart: views aside %.4f x", best_a, best_b, s->out->n, least);
-        if (err || least > worth_a_region)
+        if (err || !(least <= 1))
             break;
-        log_debug("regions: %d and %d of %d become one: views aside %.4f x", best_a, best_b, s->out->n, least);
+        log_debug("regions: %d and %d of %d become one", best_a, best_b, s->out->n);
         rename_region(s, best_b, best_a);
         memcpy(s->out->region[best_a].theta, best_theta, sizeof(best_theta));
         drop(s, best_b);
@@ -585,88 +746,6 @@ static int merge(struct search *s)
 }
 
 // ---- what is free -------------------------------------------------------------------------------------------------------
-
-// Covariance of a region's theta, albedos eliminated: A^-1 B A^-1 with B the sum of squared scores by view and by patch of the surface:
-// what the model lacks goes together there, and noise does not know it.
-static int region_uncertainty(struct search *s, const struct witnesses *w, uint16_t frozen, struct region *r)
-{
-    double A[THETA_PACKED] = { 0 }, B[THETA_PACKED] = { 0 }, C[DISNEY_N][DISNEY_N] = { { 0 } };
-    const int n_views = s->scene->samples->n_views;
-    double(*by_view)[DISNEY_N] = calloc((size_t)n_views + 1, sizeof(*by_view)), (*by_patch)[DISNEY_N] = calloc(PATCHES, sizeof(*by_patch));
-    double(*J)[DISNEY_N] = malloc(3 * TEXEL_VIEWS_MAX * sizeof(*J));
-    int err = by_view && by_patch && J ? 0 : -ENOMEM;
-    for (int k = 0; !err && k < w->n; k++) {
-        const struct texel_row *rows;
-        struct texel_sums sums = { 0 };
-        texel_fit(s->scene, s->worker[0], w->texel[k], 0, r->theta, s->albedo[w->texel[k]], 1, &sums);
-        const int n = texel_rows(s->scene, s->worker[0], w->texel[k], r->theta, s->albedo[w->texel[k]], &rows);
-        double own[6] = { 1e-12, 0, 1e-12, 0, 0, 1e-12 }, mixed[DISNEY_N][3] = { { 0 } };
-        for (int i = 0; i < n; i++)
-            for (int a = 0; a < 3; a++) {
-                for (int b = 0; b <= a; b++)
-                    own[packed_at(a, b)] += (double)rows[i].J[DISNEY_N + a] * (double)rows[i].J[DISNEY_N + b];
-                for (int p = 0; p < DISNEY_N; p++)
-                    mixed[p][a] += (double)rows[i].J[DISNEY_N + a] * (double)rows[i].J[p];
-            }
-        if (!packed_factor(3, own))
-            continue;
-        for (int p = 0; p < DISNEY_N; p++)
-            packed_solve(3, own, mixed[p]);
-        for (int i = 0; i < n; i++) {
-            const int patch = (int)((int64_t)k * PATCHES / w->n);
-            for (int p = 0; p < DISNEY_N; p++) {
-                J[i][p] = (double)rows[i].J[p];
-                for (int a = 0; a < 3; a++)
-                    J[i][p] -= mixed[p][a] * (double)rows[i].J[DISNEY_N + a];
-                by_view[rows[i].view][p] += J[i][p] * (double)rows[i].residual;
-                by_patch[patch][p] += J[i][p] * (double)rows[i].residual;
-            }
-            for (int p = 0; p < DISNEY_N; p++)
-                for (int q = 0; q <= p; q++)
-                    A[packed_at(p, q)] += J[i][p] * J[i][q];
-        }
-    }
-    for (int p = 0; !err && p < DISNEY_N; p++) {
-        A[packed_at(p, p)] += hold;
-        for (int q = 0; q <= p; q++) {
-            if ((frozen >> p & 1) || (frozen >> q & 1))
-                continue;
-            for (int v = 0; v < n_views; v++)
-                B[packed_at(p, q)] += by_view[v][p] * by_view[v][q];
-            for (int v = 0; v < PATCHES; v++)
-                B[packed_at(p, q)] += by_patch[v][p] * by_patch[v][q];
-        }
-    }
-    free(by_view);
-    free(by_patch);
-    free(J);
-    if (err)
-        return err;
-    for (int p = 0; p < DISNEY_N; p++) {
-        for (int q = 0; q < DISNEY_N && (frozen >> p & 1); q++)
-            A[packed_at(p, q)] = p == q;
-        B[packed_at(p, p)] += frozen >> p & 1 ? 0 : .25 * hold * hold; // `hold` draws from a truth that is some .5 away
-    }
-    double inverse[DISNEY_N][DISNEY_N] = { { 0 } };
-    const bool regular = packed_factor(DISNEY_N, A);
-    for (int p = 0; regular && p < DISNEY_N; p++) {
-        inverse[p][p] = 1;
-        packed_solve(DISNEY_N, A, inverse[p]);
-    }
-    for (int p = 0; p < DISNEY_N; p++)
-        for (int q = 0; q < DISNEY_N; q++)
-            for (int a = 0; a < DISNEY_N; a++)
-                for (int b = 0; b < DISNEY_N; b++)
-                    C[p][q] += inverse[p][a] * B[packed_at(a, b)] * inverse[b][q];
-    for (int p = 0; p < DISNEY_N; p++) {
-        // what the data do not say, or say no better than that it is a number in [0,1], has no standard deviation
-        const double said = regular && !(frozen >> p & 1) ? 1 - hold * inverse[p][p] : 0;
-        r->std[p] = said > .5 && C[p][p] < 1. / 12 ? (float)sqrt(C[p][p]) : INFINITY;
-        for (int q = 0; q <= p; q++)
-            r->covariance[packed_at(p, q)] = C[p][q];
-    }
-    return 0;
-}
 
 // Does the region do without? What views set aside are better off without, or neither miss nor tell from plain by two standard deviations,
 // stays plain. Metal first: a little of it passes for anything.
@@ -682,7 +761,7 @@ static int simplify(struct search *s, const struct witnesses *w, struct region *
         struct region simpler = *r;
         const int p = __builtin_ctz(without[k]); // the layer's amount; the other says how it looks
         double error;
-        err = region_uncertainty(s, w, *frozen, r);
+        err = region_uncertainty(s, s->scene, w, *frozen, r, NULL);
         if (!k)
             *full = *r;
         if (!err)
@@ -712,7 +791,9 @@ static int choose_freedom(struct search *s, struct region *r, int at)
     double error2 = 0, std;
     uint16_t free_mask = 0, frozen = 0;
     call_witnesses(s, 1u << at, &w);
-    int err = fit_shared(s, &s->inner, &w, 0, false, r->theta);
+    struct shared_fit first = { .s = s, .scene = &s->inner, .w = &w };
+    double cost;
+    int err = w.n ? fit_from(&first, r->theta, 100, 1e-8, r->theta, &cost) : 0; // to the end: clearcoat against sheen is a long valley
     if (!err)
         err = simplify(s, &w, r, at, &frozen, &error2, &full);
     for (int p = 0; p < DISNEY_N; p++)
@@ -732,11 +813,10 @@ static int choose_freedom(struct search *s, struct region *r, int at)
     }
     r->aside_rmse_percent = 100 * sqrt(error2);
     struct shared_fit last = { .s = s, .scene = s->scene, .w = &w, .frozen = frozen };
-    double cost;
-    if (!err && w.n) // to the end: clearcoat against sheen is a long valley
+    if (!err && w.n)
         err = fit_from(&last, r->theta, 100, 1e-8, r->theta, &cost);
     if (!err)
-        err = region_uncertainty(s, &w, frozen, r);
+        err = region_uncertainty(s, s->scene, &w, frozen, r, NULL);
     // What was frozen might have been otherwise: the doubt is that of the full model, and how far freezing moved the others.
     for (int p = 0; !err && p < DISNEY_N; p++)
         if (isfinite(r->std[p]))
@@ -791,7 +871,7 @@ static int search_new(struct search *s, const struct texel_scene *scene, const s
 int regions_find(struct regions *out, uint8_t *region_of, const struct texel_scene *scene, const struct level *level,
                  const float (*theta)[DISNEY_N], float (*albedo)[3], int n_threads)
 {
-    struct search s = { .albedo = albedo, .n_threads = n_threads, .region = region_of, .out = out };
+    struct search s = { .albedo = albedo, .n_threads = n_threads, .region = region_of, .out = out, .hold = first_hold };
     memset(out, 0, sizeof(*out));
     int err = search_new(&s, scene, level);
     if (!err)
@@ -843,7 +923,7 @@ static void cost_doubtful(void *arg, int64_t begin, int64_t end, int worker)
                 const int32_t t = l->first_delegate ? l->delegate[first + d] : i;
                 float albedo[3];
                 memcpy(albedo, f->albedo[t], sizeof(albedo));
-                texel_fit(f->scene, f->worker[worker], t, 0, f->r->region[r].theta, albedo, 1, &sums);
+                texel_fit_albedo(f->scene, f->worker[worker], t, 0, f->r->region[r].theta, albedo, 1, &sums);
             }
             if (f->candidates[i] >> r & 1)
                 cost[r] = (float)(sums.cost / fmax(sums.n, 1));

@@ -22,9 +22,9 @@ struct studio { // a take with its true lights
     uint8_t held_out[N_VIEWS];
     struct materials solved; // by materials_defaults()
 };
-static struct studio d3, d5;
+static struct studio d3, d5, noiseless; // noiseless: D3
 
-static int open_studio(struct studio *s, int data_set, int texture, double noise)
+static int open_studio(struct studio *s, const char *name, int data_set, int texture, double noise)
 {
     struct synth_settings synth = synth_defaults(data_set);
     struct samples_settings gather = samples_defaults();
@@ -32,7 +32,7 @@ static int open_studio(struct studio *s, int data_set, int texture, double noise
     static char paths[N_VIEWS][1000];
     synth.n_true_lights = 64, synth.panorama_width_px = 256, synth.texture_size = 128;
     synth.width_px = 180, synth.height_px = 120, synth.n_views = N_VIEWS, synth.samples = 1, synth.noise = noise;
-    snprintf(s->take_dir, sizeof(s->take_dir), "%s/D%d", scratch_dir, data_set);
+    snprintf(s->take_dir, sizeof(s->take_dir), "%s/%s", scratch_dir, name);
     int err = synth_write(&synth, s->take_dir);
     if (!err)
         err = truth_open(&s->truth, s->take_dir);
@@ -74,7 +74,7 @@ static int open_studios(void **state)
 {
     (void)state;
     log_set_level(LOG_ERROR);
-    return scratch_open() || open_studio(&d3, 3, 48, .002) || open_studio(&d5, 5, 96, 0);
+    return scratch_open() || open_studio(&d3, "D3", 3, 48, .002) || open_studio(&d5, "D5", 5, 96, 0) || open_studio(&noiseless, "noiseless", 3, 32, 0);
 }
 
 static int remove_one(const char *path, const struct stat *st, int kind, struct FTW *at)
@@ -92,7 +92,7 @@ static void close_studio(struct studio *s)
 static int close_studios(void **state)
 {
     (void)state;
-    close_studio(&d3), close_studio(&d5);
+    close_studio(&d3), close_studio(&d5), close_studio(&noiseless);
     return nftw(scratch_dir, remove_one, 16, FTW_DEPTH | FTW_PHYS);
 }
 
@@ -262,6 +262,52 @@ static void one_material_stays_one_and_is_found(void **state)
     assert_true(fabs((double)r->theta[DISNEY_ROUGHNESS] - .6) < .03);
 }
 
+// Lights as a solve finds them: each some per cent too near or too far, the centre a centimetre off.
+static int lights_off(struct lights *out, const struct lights *from, double by, uint64_t seed)
+{
+    int err = lights_new(out, from->n);
+    if (err)
+        return err;
+    memcpy(out->world_from_probe, from->world_from_probe, sizeof(out->world_from_probe));
+    for (int c = 0; c < 3; c++)
+        out->centre_m[c] = from->centre_m[c] + .01 * random_normal(seed, 1000, (uint64_t)c);
+    for (int i = 0; i < from->n; i++) {
+        memcpy(out->dir_probe[i], from->dir_probe[i], sizeof(out->dir_probe[i]));
+        memcpy(out->irradiance[i], from->irradiance[i], sizeof(out->irradiance[i]));
+        out->inverse_distance[i] = from->inverse_distance[i] * (1 + by * random_normal(seed, 0, (uint64_t)i));
+        out->group[i] = from->group[i];
+    }
+    return 0;
+}
+
+static int n_regions_under_lights_off(const struct studio *s, double by, uint64_t seed)
+{
+    struct materials m;
+    struct lights off;
+    struct materials_input in = input_of(s);
+    struct materials_settings set = materials_defaults();
+    assert_int_equal(lights_off(&off, &s->truth.lights, by, seed), 0);
+    in.lights = &off;
+    set.look = true; // regions, nothing judged
+    assert_int_equal(materials_solve(&m, &in, &set), 0);
+    const int n = m.regions.n;
+    materials_free(&m), lights_free(&off);
+    return n;
+}
+
+static void lights_that_are_off_make_no_second_material(void **state)
+{
+    (void)state;
+    for (uint64_t seed = 1; seed <= 3; seed++)
+        assert_int_equal(n_regions_under_lights_off(&noiseless, .08, seed), 1);
+}
+
+static void lights_that_are_off_hide_no_material(void **state)
+{
+    (void)state;
+    assert_in_range(n_regions_under_lights_off(&d5, .02, 1), 3, REGIONS_MAX); // metal, rubber, and what is between
+}
+
 static void what_is_said_to_be_known_is(void **state)
 {
     (void)state;
@@ -275,6 +321,96 @@ static void what_is_said_to_be_known_is(void **state)
             }
     assert_true(n > 4 * m->n_texels); // it is not silent either
     assert_true(n_within > .95 * n);
+}
+
+// One light at a time: what a texel's light changes by when the light, or the centre of all, is moved by what is not known of it.
+static void doubt_of_the_light_is_what_moving_it_changes(void **state)
+{
+    (void)state;
+    const struct materials_settings set = materials_defaults();
+    int n_looked_at = 0;
+    for (int i = 0; i < d3.truth.lights.n; i += 5) {
+        struct lights one;
+        assert_int_equal(lights_new(&one, 1), 0);
+        memcpy(one.dir_probe[0], d3.truth.lights.dir_probe[i], sizeof(one.dir_probe[0]));
+        memcpy(one.world_from_probe, d3.truth.lights.world_from_probe, sizeof(one.world_from_probe));
+        memcpy(one.centre_m, d3.truth.lights.centre_m, sizeof(one.centre_m));
+        one.irradiance[0][0] = one.irradiance[0][1] = one.irradiance[0][2] = 1;
+        one.inverse_distance[0] = d3.truth.lights.inverse_distance[i];
+        one.group[0] = -1;
+        struct materials_input in = input_of(&d3);
+        struct estimate e;
+        in.lights = &one, in.visible = NULL;
+        assert_int_equal(estimate_new(&e, &in, &set), 0);
+        for (int t = 3; t < d3.texels.n; t += 97)
+            for (int what = 0; what < 4; what++) { // the distance; the centre along x, y, z
+                const float std = what ? 0 : .01f * (float)one.inverse_distance[0];
+                struct materials_input asked = in;
+                const struct judging j = { .e = &e, .in = &asked, .inverse_distance_std = &std };
+                double E[2], nearly = 0;
+                for (int c = 0; c < 3; c++)
+                    asked.centre_std_m[c] = what == c + 1 ? .001 : 0;
+                for (int side = 0; side < 2; side++) {
+                    struct lights moved = one;
+                    struct light_at at;
+                    const float *p = d3.texels.position_m[t], *n = d3.texels.normal[t];
+                    const double position[3] = { (double)p[0], (double)p[1], (double)p[2] };
+                    double inverse_distance = one.inverse_distance[0] + (side ? 1 : -1) * (double)std;
+                    moved.inverse_distance = &inverse_distance;
+                    if (what)
+                        moved.centre_m[what - 1] += side ? .001 : -.001;
+                    light_at_point(&moved, 0, position, &at);
+                    const double cosine = (double)n[0] * at.l[0] + (double)n[1] * at.l[1] + (double)n[2] * at.l[2];
+                    E[side] = at.weight * fmax(cosine, 0);
+                    nearly = side && cosine < .05 ? 1 : nearly;
+                }
+                if (!(E[0] > 0) || !(E[1] > 0) || nearly > 0)
+                    continue;
+                assert_true(fabs(light_doubt(&j, t) - .5 * fabs(log(E[1] / E[0]))) < 1e-4);
+                n_looked_at++;
+            }
+        estimate_free(&e), lights_free(&one);
+    }
+    assert_true(n_looked_at > 200);
+}
+
+static void what_is_not_known_of_the_lights_is_not_known_of_the_albedo(void **state)
+{
+    (void)state;
+    const struct materials_settings set = materials_defaults();
+    double within[2] = { 0 };
+    for (uint64_t seed = 1; seed <= 2; seed++)
+        for (int told = 0; told < 2; told++) {
+            struct materials m;
+            struct lights off;
+            struct materials_input in = input_of(&noiseless);
+            double std[64];
+            int n = 0, n_within = 0;
+            assert_int_equal(lights_off(&off, &noiseless.truth.lights, .08, seed), 0);
+            for (int i = 0; i < off.n; i++)
+                std[i] = .08 * off.inverse_distance[i];
+            in.lights = &off;
+            if (told) {
+                in.inverse_distance_std = std;
+                in.centre_std_m[0] = in.centre_std_m[1] = in.centre_std_m[2] = .01;
+            }
+            assert_int_equal(materials_solve(&m, &in, &set), 0);
+            for (int t = 0; t < m.n_texels; t++)
+                for (int c = 0; c < 3; c++)
+                    if (m.validity[t] != MATERIAL_UNOBSERVED) {
+                        const struct image *a = &noiseless.truth.albedo;
+                        const int x = (int)((noiseless.texels.pixel[t] % (uint32_t)noiseless.texels.size + .5) * a->width / noiseless.texels.size);
+                        const int y = (int)((noiseless.texels.pixel[t] / (uint32_t)noiseless.texels.size + .5) * a->height / noiseless.texels.size);
+                        const float truth = a->data[((size_t)y * (size_t)a->width + (size_t)x) * (size_t)a->n_channels + (size_t)c];
+                        n++;
+                        n_within += fabsf(m.albedo[t][c] - truth) <= 1.645f * m.std[t][DISNEY_N + c];
+                    }
+            assert_true(n > m.n_texels);
+            within[told] += (double)n_within / n / 2;
+            materials_free(&m), lights_free(&off);
+        }
+    assert_true(within[1] > .85); // of 90 % intervals
+    assert_true(within[0] < .75); // who takes the lights for known is too sure
 }
 
 static void four_materials_are_told_apart(void **state)
@@ -428,7 +564,11 @@ int main(void)
         cmocka_unit_test(gradient_of_a_texel_is_the_derivative_of_its_cost),
         cmocka_unit_test(a_step_by_pcg_is_that_of_the_dense_system),
         cmocka_unit_test(one_material_stays_one_and_is_found),
+        cmocka_unit_test(lights_that_are_off_make_no_second_material),
+        cmocka_unit_test(lights_that_are_off_hide_no_material),
         cmocka_unit_test(what_is_said_to_be_known_is),
+        cmocka_unit_test(doubt_of_the_light_is_what_moving_it_changes),
+        cmocka_unit_test(what_is_not_known_of_the_lights_is_not_known_of_the_albedo),
         cmocka_unit_test(four_materials_are_told_apart),
         cmocka_unit_test(selection_beats_the_plain_fit_on_views_not_fitted),
         cmocka_unit_test(same_bytes_for_any_number_of_threads),

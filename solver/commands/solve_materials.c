@@ -201,6 +201,8 @@ int solve_find_materials(struct materials *out, const struct solve_materials *se
     struct materials_input input = { .texels = &in->texels, .samples = samples, .lights = &stage1->state.lights, .hold_out = held_out,
                                      .log_gain = stage1->state.log_gain, .rays = in->rays, .mesh = &in->mesh,
                                      .start_albedo = (const float(*)[3])stage1->state.albedo };
+    input.inverse_distance_std = stage1->inverse_distance_std;
+    memcpy(input.centre_std_m, stage1->centre_std_m, sizeof(input.centre_std_m));
     memcpy(input.start_theta, stage1->state.theta, sizeof(input.start_theta));
     settings.n_threads = n_threads;
     settings.seams = !set->no_seams;

@@ -1,8 +1,9 @@
-// tests/bench/judge_materials.c - judge_materials SOLVE_DIR TAKE [RELIT_RENDERS]: the textures of a solve beside the truth of its take.
+// tests/bench/judge_materials.c - judge_materials [--csv] SOLVE_DIR TAKE [RELIT_RENDERS]: the textures of a solve beside the truth of its take.
 //
 // Per region of truth/region_id.exr (or one for all), over texels that are measured and lie amid their region: each parameter's true mean,
 // the solve's mean, the RMS error, the median of the standard deviations it claims and the share of texels whose truth lies within 1.645 of
-// them; the albedo's relative error and share. "In shadow": where more than 30 % of the light that could arrive (solve's lights) is blocked.
+// them, of those that claim one (an infinite deviation claims nothing); the albedo's relative error and share. "In shadow": where more than 30 % of the light that could arrive (solve's lights) is blocked.
+// --csv: region, name, texels, of them with a deviation, of those within, true mean, mean, RMS error, median deviation.
 // RELIT_RENDERS: what `rigsolve render` made of TAKE/relit's cameras; compared where the object covers the pixel and all around it.
 #include "solver/visibility.h"
 #include "tests/judgement.h"
@@ -85,7 +86,7 @@ static int region_at(const struct truth_maps *t, int size, uint32_t pixel)
 }
 
 struct tally {
-    int n, n_std, n_within;
+    int n, n_std, n_claimed, n_within; // claimed: with a standard deviation; an infinite one claims nothing
     double sum, sum_true, squares, squares_true, *std;
 };
 
@@ -95,7 +96,8 @@ static void tally_add(struct tally *t, double value, double truth, double std)
     t->sum += value, t->sum_true += truth;
     t->squares += (value - truth) * (value - truth), t->squares_true += truth * truth;
     t->std[t->n_std++] = std;
-    t->n_within += fabs(value - truth) <= 1.645 * std;
+    t->n_claimed += isfinite(std);
+    t->n_within += isfinite(std) && fabs(value - truth) <= 1.645 * std;
 }
 
 static int by_value(const void *a, const void *b)
@@ -104,15 +106,25 @@ static int by_value(const void *a, const void *b)
     return (x > y) - (x < y);
 }
 
-static void tally_print(struct tally *t, const char *name, bool relative)
+static bool as_csv;
+
+static void tally_print(struct tally *t, int region, const char *name, bool relative)
 {
     if (!t->n)
         return;
     qsort(t->std, (size_t)t->n_std, sizeof(double), by_value);
+    if (as_csv) {
+        printf("%d,%s,%d,%d,%d,%.6f,%.6f,%.6f,%.6f\n", region, name, t->n, t->n_claimed, t->n_within, t->sum_true / t->n, t->sum / t->n,
+               sqrt(t->squares / t->n), t->std[t->n_std / 2]);
+        return;
+    }
     printf("  %-16s true %.4f  found %.4f  RMS error %.4f", name, t->sum_true / t->n, t->sum / t->n, sqrt(t->squares / t->n));
     if (relative)
         printf(" (%.2f %%)", 100 * sqrt(t->squares / t->squares_true));
-    printf("  std %.4f  within 90 %%: %.1f %%\n", t->std[t->n_std / 2], 100. * t->n_within / t->n);
+    printf("  std %.4f", t->std[t->n_std / 2]);
+    if (t->n_claimed)
+        printf("  within 90 %%: %.1f %%", 100. * t->n_within / t->n_claimed);
+    printf("\n");
 }
 
 // Share of the light above the horizon that nothing blocks, by luminance.
@@ -203,13 +215,14 @@ static int judge_textures(const char *solve, const char *take_dir)
         }
         if (!a.n)
             continue;
-        printf("region %d: %d texels\n", region, a.n / 3);
+        if (!as_csv)
+            printf("region %d: %d texels\n", region, a.n / 3);
         for (int k = 0; k < DISNEY_N; k++)
-            tally_print(&p[k], disney_parameter_names[k], false);
-        tally_print(&a, "albedo", true);
+            tally_print(&p[k], region, disney_parameter_names[k], false);
+        tally_print(&a, region, "albedo", true);
         if (shadowed.n) {
-            tally_print(&shadowed, "  in shadow", true);
-            tally_print(&lit, "  in light", true);
+            tally_print(&shadowed, region, as_csv ? "albedo in shadow" : "  in shadow", true);
+            tally_print(&lit, region, as_csv ? "albedo in light" : "  in light", true);
         }
     }
     free(scratch), free(share);
@@ -277,8 +290,10 @@ static int judge_relit(const char *take_dir, const char *renders)
 
 int main(int argc, char **argv)
 {
-    if (argc != 3 && argc != 4) {
-        fprintf(stderr, "usage: judge_materials SOLVE_DIR TAKE [RELIT_RENDERS]\n");
+    if (argc > 1 && !strcmp(argv[1], "--csv"))
+        as_csv = true, argc--, argv++;
+    if ((argc != 3 && argc != 4) || argv[1][0] == '-') {
+        fprintf(stderr, "usage: judge_materials [--csv] SOLVE_DIR TAKE [RELIT_RENDERS]\n");
         return 2;
     }
     int err = judge_textures(argv[1], argv[2]);
