@@ -12,10 +12,12 @@ struct interreflection {
     const struct kernels *kernels;
     const uint16_t *visible;     // [n_texels][words_per_texel], or NULL
     int words_per_texel;
+    const uint8_t *soft;         // [n_texels][lights->n] visible share x 255; or NULL: visible says all
     const float (*diffuse)[3];   // [n_texels] reflectance
-    int n_rays;                  // per texel, over the hemisphere by cosine
+    int n_rays;                  // per place where light is gathered, over the hemisphere by cosine
+    int size;                    // finer textures than size x size gather at places so far apart, and texels between them interpolate; 0: every texel
     int n_threads;
 };
 // indirect[n_texels]: irradiance from other parts of the surface. In: that of an earlier call (or 0), which then is reflected too, so that each call adds a bounce. Same bytes
-// for any thread count. 0 or -ENOMEM.
+// for any thread count. 0, -EINVAL (no place for light at this size: logged), -ENOMEM; indirect is then as it was.
 int interreflection_gather(const struct interreflection *s, float (*indirect)[3]);

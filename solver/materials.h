@@ -38,6 +38,7 @@ struct materials_input {
     const struct lights *lights;
     const uint16_t *visible;        // [n_texels][words_per_texel], or NULL
     int words_per_texel;
+    const uint8_t *soft;            // [n_texels][lights->n] visible share x 255, in place of visible; or NULL
     const double *log_gain;         // [n_views], or NULL
     const uint8_t *hold_out;        // [n_views] 1: never fitted, only reported; or NULL
     const struct rays *rays;        // for n_bounces; else NULL

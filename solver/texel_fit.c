@@ -73,6 +73,14 @@ void texel_worker_free(struct texel_worker *w)
 
 // ---- what is known of the texel -----------------------------------------------------------------------------------------
 
+// The lights that reach a texel.
+static void gather_lights(const struct texel_scene *s, struct texel_worker *w, int texel, const struct surface_point *point)
+{
+    const size_t t = (size_t)texel;
+    s->kernels->gather(&w->lit, &s->lights, point, s->visible && !s->soft ? s->visible + t * (size_t)s->words_per_texel : NULL,
+                       s->soft ? s->soft + t * (size_t)s->lights.n : NULL);
+}
+
 static void surface_of(struct surface_point *out, const struct texels *t, int texel)
 {
     memcpy(out->position_m, t->position_m[texel], sizeof(out->position_m));
@@ -127,8 +135,7 @@ static void shade(const struct texel_scene *s, struct texel_worker *w, int texel
     memcpy(m.theta, theta, sizeof(m.theta));
     memcpy(m.albedo, albedo, sizeof(m.albedo));
     surface_of(&point, s->texels, texel);
-    s->kernels->gather(&w->lit, &s->lights, &point,
-                       s->visible ? s->visible + (size_t)texel * (size_t)s->words_per_texel : NULL, NULL);
+    gather_lights(s, w, texel, &point);
     s->kernels->shade_jacobian_views(w->jacobian, n, &w->lit, &point, (const float(*)[3])w->v, &m);
     for (int k = 0; k < n; k++) {
         struct shade_jacobian *d = &w->jacobian[k];
@@ -283,8 +290,7 @@ void texel_measure(const struct texel_scene *s, struct texel_worker *w, int texe
     memcpy(m.theta, theta, sizeof(m.theta));
     memcpy(m.albedo, albedo, sizeof(m.albedo));
     surface_of(&point, s->texels, texel);
-    s->kernels->gather(&w->lit, &s->lights, &point,
-                       s->visible ? s->visible + (size_t)texel * (size_t)s->words_per_texel : NULL, NULL);
+    gather_lights(s, w, texel, &point);
     for (int k = 0; k < n; k++) {
         struct observation *o = &w->seen[k];
         float L[3];
