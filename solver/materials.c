@@ -19,11 +19,13 @@ enum {
     SELECT_SIZE = 64,      // regions are found on the finest level no larger
     EVALUATE_CHUNK = 32, ROW_CHUNK = 2048,
     WEAK_SAMPLES = 8,
+    ALL_TIED = (1 << DISNEY_N) - 1,
     BOUNCE_RAYS = 256, BOUNCE_SIZE = 256, // rays per place where indirect light is gathered; textures finer than this interpolate it
     BOUNCE_LOOKS = 3,      // how often the albedo is found and light sent out again
 };
 static const double first_mu = 1e-3, least_mu = 1e-7, most_mu = 1e9;
 static const float settled = 5e-4f; // a smaller step is not worth looking at the samples again
+static const double light_settled = 3e-4; // of white: what half floats and look-ups leave in any comparison
 
 struct materials_settings materials_defaults(void)
 {
@@ -129,9 +131,10 @@ static void evaluate(void *arg, int64_t begin, int64_t end, int worker, double *
         int n_delegates = l->first_delegate ? l->first_delegate[i + 1] - l->first_delegate[i] : 1;
         if (n_delegates > DELEGATES_MAX)
             n_delegates = DELEGATES_MAX;
+        const bool moves = tied_of(t, i) != ALL_TIED;
         for (int d = 0; d < n_delegates; d++) {
             memcpy(albedo[d], e->albedo[delegate[d]], sizeof(albedo[d]));
-            texel_fit(&e->scene, e->worker[worker], delegate[d], l->first_delegate ? DELEGATE_VIEWS : 0, theta, albedo[d],
+            (moves ? texel_fit : texel_fit_albedo)(&e->scene, e->worker[worker], delegate[d], l->first_delegate ? DELEGATE_VIEWS : 0, theta, albedo[d],
                       t->scale ? t->scale[i] : 1, &sums);
         }
         partial[1] += sums.distance, partial[2] += sums.n, partial[3] += sums.n;
@@ -203,7 +206,7 @@ static void assemble(void *arg, int64_t begin, int64_t end, int worker)
             memset(M, 0, sizeof(M));
             for (int p = 0; p < DISNEY_N; p++)
                 M[packed_at(p, p)] = 1;
-            t->frozen[k] = (1 << DISNEY_N) - 1;
+            t->frozen[k] = ALL_TIED;
             t->mu[k] *= 10;
         }
         for (int p = 0; p < THETA_PACKED; p++)
@@ -386,6 +389,15 @@ static int solve_tile(struct tile *t, int most_iterations, struct materials_leve
     return err;
 }
 
+static bool any_free(const struct regions *r)
+{
+    for (int k = 0; r && k < r->n; k++)
+        for (int p = 0; p < DISNEY_N; p++)
+            if (r->region[k].freedom[p] == PARAMETER_FREE)
+                return true;
+    return !r || !r->n;
+}
+
 // theta[level n] in and out. scale[level n] or NULL.
 static int solve_level(struct estimate *e, int k, float (*theta)[DISNEY_N], const float (*parent_theta)[DISNEY_N],
                        const uint8_t *region, const double *scale, struct materials_level *report)
@@ -399,6 +411,8 @@ static int solve_level(struct estimate *e, int k, float (*theta)[DISNEY_N], cons
         for (int p = 0; p < DISNEY_N; p++)
             if (e->regions->region[region[i]].freedom[p] != PARAMETER_FREE)
                 theta[i][p] = e->regions->region[region[i]].theta[p];
+    if (!finest && !any_free(region ? e->regions : NULL))
+        return 0; // what is left to find is the albedo, and that is the finest texels'
     for (int begin = 0; !err && begin < l->n; begin += TILE_TEXELS) {
         struct tile t = { .e = e, .level = l, .begin = begin, .n = l->n - begin < TILE_TEXELS ? l->n - begin : TILE_TEXELS, .finest = finest,
                           .theta = theta, .parent_theta = parent_theta, .region = region, .scale = scale,
@@ -726,12 +740,18 @@ static void fit_albedos(void *arg, int64_t begin, int64_t end, int worker)
     }
 }
 
-static int bounce(struct estimate *e, const struct materials_input *in, struct materials *m, float (*indirect)[3])
+// *settled_now: the pictures would not know this light from that before.
+static int bounce(struct estimate *e, const struct materials_input *in, struct materials *m, float (*indirect)[3], bool *settled_now)
 {
     struct judging j = { .e = e, .m = m };
-    float(*diffuse)[3] = malloc(((size_t)m->n_texels + 1) * sizeof(*diffuse));
-    if (!diffuse)
+    const size_t n = (size_t)m->n_texels;
+    double change2 = 0;
+    float(*diffuse)[3] = malloc((n + 1) * sizeof(*diffuse)), (*before)[3] = malloc((n + 1) * sizeof(*before));
+    if (!diffuse || !before) {
+        free(diffuse);
+        free(before);
         return -ENOMEM;
+    }
     const struct interreflection light = { .texels = in->texels, .mesh = in->mesh, .rays = in->rays, .lights = &e->scene.lights, .kernels = e->scene.kernels,
                                            .visible = in->visible, .words_per_texel = in->words_per_texel, .soft = in->soft,
                                            .diffuse = (const float(*)[3])diffuse, .n_rays = BOUNCE_RAYS, .size = BOUNCE_SIZE, .n_threads = e->set->n_threads };
@@ -740,10 +760,18 @@ static int bounce(struct estimate *e, const struct materials_input *in, struct m
     for (int t = 0; t < m->n_texels; t++)
         for (int c = 0; c < 3; c++)
             diffuse[t][c] = e->albedo[t][c] * (1 - m->theta[t][DISNEY_METALLIC]);
-    memset(indirect, 0, (size_t)m->n_texels * sizeof(*indirect));
+    memcpy(before, indirect, n * sizeof(*before));
+    memset(indirect, 0, n * sizeof(*indirect));
     for (int k = 0; !err && k < e->set->n_bounces; k++)
         err = interreflection_gather(&light, indirect);
+    for (size_t t = 0; t < n; t++)
+        for (int c = 0; c < 3; c++) {
+            const double change = (double)(e->albedo[t][c] * (indirect[t][c] - before[t][c])) / M_PI;
+            change2 += change * change;
+        }
+    *settled_now = change2 < light_settled * light_settled * 3 * (double)n;
     free(diffuse);
+    free(before);
     return err;
 }
 
@@ -759,6 +787,7 @@ int materials_solve(struct materials *out, const struct materials_input *in, con
     struct estimate e;
     struct materials m = { .n_texels = in->texels->n, .rmse_held_out_percent = -1 };
     struct materials_settings look = *set;
+    bool whole = false;
     const size_t n = (size_t)m.n_texels + 1;
     memset(out, 0, sizeof(*out));
     int err = estimate_new(&e, in, set);
@@ -773,20 +802,25 @@ int materials_solve(struct materials *out, const struct materials_input *in, con
         float(*indirect)[3] = calloc(n, sizeof(*indirect));
         err = indirect ? 0 : -ENOMEM;
         look.most_size = set->most_size && set->most_size < SELECT_SIZE ? set->most_size : SELECT_SIZE;
+        bool settled_now = false;
         e.set = &look;
-        for (int k = 0; !err && k < BOUNCE_LOOKS; k++) {
+        for (int k = 0; !err && k < BOUNCE_LOOKS && !settled_now; k++) {
             err = pyramid(&e, in, &m);
             if (!err)
-                err = bounce(&e, in, &m, indirect);
+                err = bounce(&e, in, &m, indirect, &settled_now);
+            if (!err && settled_now && look.most_size >= in->texels->size)
+                whole = true; // the last look was all there is to see
             e.scene.indirect = (const float(*)[3])indirect; // freed with the estimate
-            e.regions = NULL;
-            clear_look(&m);
+            if (!whole) {
+                e.regions = NULL;
+                clear_look(&m);
+            }
         }
         if (!e.scene.indirect)
             free(indirect);
         e.set = set;
     }
-    if (!err)
+    if (!err && !whole)
         err = pyramid(&e, in, &m);
     if (!err && set->most_size && set->most_size < in->texels->size && set->free_albedo) {
         struct judging j = { .e = &e, .m = &m };

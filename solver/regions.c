@@ -15,12 +15,14 @@ const char *const parameter_freedom_names[3] = { "frozen", "tied", "free" };
 enum {
     FIRST_REGIONS = 6,    // cut into so many before merging
     WITNESSES = 192,      // texels a region is fitted to
+    EXPLORERS = 48,       // of them, where many places are tried
     DEAL_ROUNDS = 3,
     PATCHES = 64,         // of the surface: within one, errors of the model go together
     MOST_VIEWS = 2048,
 };
 static const double least_share = .03;       // a smaller region is dissolved: what borders and rims look like, mostly
 static const double worth_a_region = 1.10;   // squared error of views set aside, of one reflectance for two regions
+static const double certain = 3;             // standard deviations between two regions' values of a parameter
 static const double worth_a_parameter = .97; // the same with a parameter free per texel
 static const double worth_a_layer = 1.01;    // the same without clearcoat, sheen, ...
 static const double better_without = .99;
@@ -89,6 +91,8 @@ struct shared_fit {
     const struct witnesses *w;
     uint16_t frozen;         // parameters that stay plain
     float theta[DISNEY_N];
+    double sums[1 + DISNEY_N + THETA_PACKED]; // at theta
+    bool known;
 };
 
 static void add_witnesses(void *arg, int64_t begin, int64_t end, int worker, double *partial)
@@ -108,10 +112,16 @@ static void add_witnesses(void *arg, int64_t begin, int64_t end, int worker, dou
 static int shared_equations(void *arg, const double *x, double *cost, double *A, double *g)
 {
     struct shared_fit *f = arg;
-    double sums[1 + DISNEY_N + THETA_PACKED] = { 0 };
-    for (int p = 0; p < DISNEY_N; p++)
+    bool known = f->known; // a step that is taken was just looked at
+    for (int p = 0; p < DISNEY_N; p++) {
+        known = known && f->theta[p] == (float)x[p];
         f->theta[p] = (float)x[p];
-    const int err = parallel_sum(f->s->n_threads, f->w->n, 4, add_witnesses, f, 1 + DISNEY_N + THETA_PACKED, sums);
+    }
+    if (!known)
+        memset(f->sums, 0, sizeof(f->sums));
+    const double *sums = f->sums;
+    const int err = known ? 0 : parallel_sum(f->s->n_threads, f->w->n, 4, add_witnesses, f, 1 + DISNEY_N + THETA_PACKED, f->sums);
+    f->known = !err;
     *cost = sums[0];
     for (int p = 0; p < DISNEY_N; p++) {
         const double d = x[p] - (double)plain[p];
@@ -157,11 +167,14 @@ static int fit_shared(struct search *s, const struct texel_scene *scene, const s
                       float theta[DISNEY_N])
 {
     static const float starts[][2] = { { 0, .15f }, { 0, .35f }, { 0, .7f }, { 1, .2f }, { 1, .45f } }; // metallic, roughness
-    struct shared_fit f = { .s = s, .scene = scene, .w = w, .frozen = frozen };
+    struct witnesses some = { 0 }; // are enough to choose a place
+    struct shared_fit f = { .s = s, .scene = scene, .w = anywhere ? &some : w, .frozen = frozen };
     float best[DISNEY_N];
     double least;
     if (!w->n)
         return 0;
+    for (int k = 0; k < EXPLORERS && k < w->n; k++)
+        some.texel[some.n++] = w->texel[(int64_t)k * w->n / (w->n < EXPLORERS ? w->n : EXPLORERS)];
     int err = fit_from(&f, theta, anywhere ? 8 : 30, 1e-5, best, &least);
     for (size_t k = 0; !err && anywhere && k < sizeof(starts) / sizeof(*starts); k++) {
         float from[DISNEY_N], to[DISNEY_N];
@@ -174,6 +187,7 @@ static int fit_shared(struct search *s, const struct texel_scene *scene, const s
             memcpy(best, to, sizeof(best));
         }
     }
+    f.w = w, f.known = false;
     if (!err && anywhere)
         err = fit_from(&f, best, 30, 1e-5, best, &least);
     if (!err)
@@ -263,7 +277,7 @@ static void test_witnesses(void *arg, int64_t begin, int64_t end, int worker, do
         if (t->free_mask)
             fit_own(t, t->s->worker[worker], k, theta, albedo);
         else
-            texel_fit(&t->s->inner, t->s->worker[worker], t->w->texel[k], 0, theta, albedo, 1, &sums);
+            texel_fit_albedo(&t->s->inner, t->s->worker[worker], t->w->texel[k], 0, theta, albedo, 1, &sums);
         texel_measure(&t->s->aside, t->s->worker[worker], t->w->texel[k], theta, albedo, &error);
         t->error2[k] = error.n ? (float)(error.squares / (3 * (double)error.n)) : 0;
         partial[0] += error.squares, partial[1] += 3 * (double)error.n;
@@ -305,7 +319,7 @@ static void cost_nodes(void *arg, int64_t begin, int64_t end, int worker)
             if (s->texel[i] < 0)
                 continue;
             memcpy(albedo, s->albedo[s->texel[i]], sizeof(albedo));
-            texel_fit(s->scene, s->worker[worker], s->texel[i], 0, s->out->region[r].theta, albedo, 1, &sums);
+            texel_fit_albedo(s->scene, s->worker[worker], s->texel[i], 0, s->out->region[r].theta, albedo, 1, &sums);
             s->cost[i * REGIONS_MAX + r] = (float)(sums.cost / fmax(sums.n, 1));
         }
 }
@@ -516,79 +530,9 @@ static int dissolve_small(struct search *s)
     return err;
 }
 
-// By what factor the witnesses' errors grow from `alone` to `shared`: the mean over them of the logarithm, as texels are very unlike; and as
-// much less as could be chance (four standard errors).
-static double how_much_worse(const float *shared, const float *alone, int n)
-{
-    double sum = 0, squares = 0;
-    for (int k = 0; k < n; k++) {
-        const double worse = log(((double)shared[k] + rounding2) / ((double)alone[k] + rounding2));
-        sum += worse, squares += worse * worse;
-    }
-    if (n < 2)
-        return 1;
-    const double mean = sum / n, variance = fmax(squares / n - mean * mean, 0) / (n - 1);
-    return exp(mean - 4 * sqrt(variance));
-}
-
-// As long as two regions do as well under one reflectance, they are one.
-static int merge(struct search *s)
-{
-    int err = 0;
-    while (!err && s->out->n > 1) {
-        double least = INFINITY, error2;
-        float alone[REGIONS_MAX][WITNESSES];
-        struct witnesses w[REGIONS_MAX];
-        float best_theta[DISNEY_N];
-        int best_a = 0, best_b = 0;
-        for (int r = 0; !err && r < s->out->n; r++) {
-            call_witnesses(s, 1u << r, &w[r]);
-            err = test(s, &w[r], s->out->region[r].theta, 0, -1, &error2, NULL, alone[r]);
-        }
-        for (int a = 0; !err && a < s->out->n; a++)
-            for (int b = a + 1; !err && b < s->out->n; b++) {
-                struct witnesses both = { 0 }; // as many of either
-                float theta[DISNEY_N];
-                float one[WITNESSES], other[WITNESSES];
-                for (int k = 0; k < WITNESSES / 2 && k < w[a].n; k++)
-                    both.texel[both.n++] = w[a].texel[(int64_t)k * w[a].n / (w[a].n < WITNESSES / 2 ? w[a].n : WITNESSES / 2)];
-                for (int k = 0; k < WITNESSES / 2 && k < w[b].n; k++)
-                    both.texel[both.n++] = w[b].texel[(int64_t)k * w[b].n / (w[b].n < WITNESSES / 2 ? w[b].n : WITNESSES / 2)];
-                for (int p = 0; p < DISNEY_N; p++)
-                    theta[p] = .5f * (s->out->region[a].theta[p] + s->out->region[b].theta[p]);
-                err = fit_shared(s, &s->inner, &both, 0, false, theta);
-                if (!err)
-                    err = test(s, &w[a], theta, 0, -1, &error2, NULL, one);
-                if (!err)
-                    err = test(s, &w[b], theta, 0, -1, &error2, NULL, other);
-                const double ratio = err ? INFINITY : fmax(how_much_worse(one, alone[a], w[a].n), how_much_worse(other, alone[b], w[b].n));
-                if (!err && ratio < least) {
-                    least = ratio, best_a = a, best_b = b;
-                    memcpy(best_theta, theta, sizeof(theta));
-                }
-            }
-        if (!err && least > worth_a_region)
-            log_debug("regions: %d and %d of %d stay apart: views aside %.4f x", best_a, best_b, s->out->n, least);
-        if (err || least > worth_a_region)
-            break;
-        log_debug("regions: %d and %d of %d become one: views aside %.4f x", best_a, best_b, s->out->n, least);
-        rename_region(s, best_b, best_a);
-        memcpy(s->out->region[best_a].theta, best_theta, sizeof(best_theta));
-        drop(s, best_b);
-        err = fit_all(s, false);
-        if (!err)
-            err = deal_out(s);
-        if (!err)
-            err = dissolve_small(s);
-    }
-    return err;
-}
-
-// ---- what is free -------------------------------------------------------------------------------------------------------
-
 // Covariance of a region's theta, albedos eliminated: A^-1 B A^-1 with B the sum of squared scores by view and by patch of the surface:
 // what the model lacks goes together there, and noise does not know it.
-static int region_uncertainty(struct search *s, const struct witnesses *w, uint16_t frozen, struct region *r)
+static int region_uncertainty(struct search *s, const struct texel_scene *scene, const struct witnesses *w, uint16_t frozen, struct region *r)
 {
     double A[THETA_PACKED] = { 0 }, B[THETA_PACKED] = { 0 }, C[DISNEY_N][DISNEY_N] = { { 0 } };
     const int n_views = s->scene->samples->n_views;
@@ -598,8 +542,8 @@ static int region_uncertainty(struct search *s, const struct witnesses *w, uint1
     for (int k = 0; !err && k < w->n; k++) {
         const struct texel_row *rows;
         struct texel_sums sums = { 0 };
-        texel_fit(s->scene, s->worker[0], w->texel[k], 0, r->theta, s->albedo[w->texel[k]], 1, &sums);
-        const int n = texel_rows(s->scene, s->worker[0], w->texel[k], r->theta, s->albedo[w->texel[k]], &rows);
+        texel_fit_albedo(scene, s->worker[0], w->texel[k], 0, r->theta, s->albedo[w->texel[k]], 1, &sums);
+        const int n = texel_rows(scene, s->worker[0], w->texel[k], r->theta, s->albedo[w->texel[k]], &rows);
         double own[6] = { 1e-12, 0, 1e-12, 0, 0, 1e-12 }, mixed[DISNEY_N][3] = { { 0 } };
         for (int i = 0; i < n; i++)
             for (int a = 0; a < 3; a++) {
@@ -668,6 +612,101 @@ static int region_uncertainty(struct search *s, const struct witnesses *w, uint1
     return 0;
 }
 
+// By what factor the witnesses' errors grow from `alone` to `shared`: the mean over them of the logarithm, as texels are very unlike; and as
+// much less as could be chance (four standard errors).
+static double how_much_worse(const float *shared, const float *alone, int n)
+{
+    double sum = 0, squares = 0;
+    for (int k = 0; k < n; k++) {
+        const double worse = log(((double)shared[k] + rounding2) / ((double)alone[k] + rounding2));
+        sum += worse, squares += worse * worse;
+    }
+    if (n < 2)
+        return 1;
+    const double mean = sum / n, variance = fmax(squares / n - mean * mean, 0) / (n - 1);
+    return exp(mean - 4 * sqrt(variance));
+}
+
+// By how many of its standard deviations the parameter differs that tells two regions apart best.
+static double apart_in_std(const struct region *a, const struct region *b)
+{
+    double most = 0;
+    for (int p = 0; p < DISNEY_N; p++) {
+        const int at = packed_at(p, p);
+        const double d = (double)(a->theta[p] - b->theta[p]), std = unknown_misfit * sqrt(a->covariance[at] + b->covariance[at]);
+        most = fmax(most, fabs(d) / std);
+    }
+    return most;
+}
+
+// As many of either.
+static void call_both(const struct witnesses *a, const struct witnesses *b, struct witnesses *both)
+{
+    both->n = 0;
+    for (int side = 0; side < 2; side++) {
+        const struct witnesses *w = side ? b : a;
+        const int n = w->n < WITNESSES / 2 ? w->n : WITNESSES / 2;
+        for (int k = 0; k < n; k++)
+            both->texel[both->n++] = w->texel[(int64_t)k * w->n / n];
+    }
+}
+
+// Two regions are one if they do as well under one reflectance, or if no parameter of theirs differs by more than is known of it: where the
+// lights are wrong, any piece of the surface does better by itself.
+static int merge(struct search *s)
+{
+    int err = 0;
+    while (!err && s->out->n > 1) {
+        double least = INFINITY, error2;
+        float alone[REGIONS_MAX][WITNESSES];
+        struct witnesses w[REGIONS_MAX];
+        float best_theta[DISNEY_N];
+        int best_a = -1, best_b = -1;
+        for (int r = 0; !err && r < s->out->n; r++) {
+            call_witnesses(s, 1u << r, &w[r]);
+            err = test(s, &w[r], s->out->region[r].theta, 0, -1, &error2, NULL, alone[r]);
+            if (!err)
+                err = region_uncertainty(s, &s->inner, &w[r], 0, &s->out->region[r]);
+        }
+        for (int a = 0; !err && a < s->out->n; a++)
+            for (int b = a + 1; !err && b < s->out->n; b++) {
+                struct witnesses both;
+                float theta[DISNEY_N], one[WITNESSES], other[WITNESSES];
+                call_both(&w[a], &w[b], &both);
+                for (int p = 0; p < DISNEY_N; p++)
+                    theta[p] = .5f * (s->out->region[a].theta[p] + s->out->region[b].theta[p]);
+                err = fit_shared(s, &s->inner, &both, 0, false, theta);
+                if (!err)
+                    err = test(s, &w[a], theta, 0, -1, &error2, NULL, one);
+                if (!err)
+                    err = test(s, &w[b], theta, 0, -1, &error2, NULL, other);
+                if (err)
+                    break;
+                const double ratio = fmax(how_much_worse(one, alone[a], w[a].n), how_much_worse(other, alone[b], w[b].n));
+                const double apart = apart_in_std(&s->out->region[a], &s->out->region[b]);
+                log_debug("regions: %d and %d of %d as one: views aside %.4f x; theta %.1f standard deviations apart", a, b, s->out->n, ratio, apart);
+                if ((ratio <= worth_a_region || apart <= certain) && ratio < least) {
+                    least = ratio, best_a = a, best_b = b;
+                    memcpy(best_theta, theta, sizeof(theta));
+                }
+            }
+        if (err || best_a < 0)
+            break;
+        log_debug("regions: %d and %d of %d become one", best_a, best_b, s->out->n);
+        rename_region(s, best_b, best_a);
+        memcpy(s->out->region[best_a].theta, best_theta, sizeof(best_theta));
+        drop(s, best_b);
+        err = fit_all(s, false);
+        if (!err)
+            err = deal_out(s);
+        if (!err)
+            err = dissolve_small(s);
+    }
+    return err;
+}
+
+// ---- what is free -------------------------------------------------------------------------------------------------------
+
 // Does the region do without? What views set aside are better off without, or neither miss nor tell from plain by two standard deviations,
 // stays plain. Metal first: a little of it passes for anything.
 static int simplify(struct search *s, const struct witnesses *w, struct region *r, int at, uint16_t *frozen, double *error2,
@@ -682,7 +721,7 @@ static int simplify(struct search *s, const struct witnesses *w, struct region *
         struct region simpler = *r;
         const int p = __builtin_ctz(without[k]); // the layer's amount; the other says how it looks
         double error;
-        err = region_uncertainty(s, w, *frozen, r);
+        err = region_uncertainty(s, s->scene, w, *frozen, r);
         if (!k)
             *full = *r;
         if (!err)
@@ -736,7 +775,7 @@ static int choose_freedom(struct search *s, struct region *r, int at)
     if (!err && w.n) // to the end: clearcoat against sheen is a long valley
         err = fit_from(&last, r->theta, 100, 1e-8, r->theta, &cost);
     if (!err)
-        err = region_uncertainty(s, &w, frozen, r);
+        err = region_uncertainty(s, s->scene, &w, frozen, r);
     // What was frozen might have been otherwise: the doubt is that of the full model, and how far freezing moved the others.
     for (int p = 0; !err && p < DISNEY_N; p++)
         if (isfinite(r->std[p]))
@@ -843,7 +882,7 @@ static void cost_doubtful(void *arg, int64_t begin, int64_t end, int worker)
                 const int32_t t = l->first_delegate ? l->delegate[first + d] : i;
                 float albedo[3];
                 memcpy(albedo, f->albedo[t], sizeof(albedo));
-                texel_fit(f->scene, f->worker[worker], t, 0, f->r->region[r].theta, albedo, 1, &sums);
+                texel_fit_albedo(f->scene, f->worker[worker], t, 0, f->r->region[r].theta, albedo, 1, &sums);
             }
             if (f->candidates[i] >> r & 1)
                 cost[r] = (float)(sums.cost / fmax(sums.n, 1));

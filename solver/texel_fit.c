@@ -246,8 +246,9 @@ static int fit(const struct texel_scene *s, struct texel_worker *w, int texel, i
     return n;
 }
 
-void texel_fit(const struct texel_scene *s, struct texel_worker *w, int texel, int most_views, const float theta[DISNEY_N],
-               float albedo[3], double scale, struct texel_sums *out)
+// texel_fit without its derivatives. Returns how many samples there are.
+static int fit_and_add(const struct texel_scene *s, struct texel_worker *w, int texel, int most_views, const float theta[DISNEY_N],
+                       float albedo[3], double scale, struct texel_sums *out)
 {
     const int n = fit(s, w, texel, most_views, theta, albedo);
     for (int k = 0; k < n; k++) {
@@ -255,6 +256,19 @@ void texel_fit(const struct texel_scene *s, struct texel_worker *w, int texel, i
         out->distance += (double)distance_of(&w->seen[k]);
     }
     out->n += n;
+    return n;
+}
+
+void texel_fit_albedo(const struct texel_scene *s, struct texel_worker *w, int texel, int most_views, const float theta[DISNEY_N],
+                      float albedo[3], double scale, struct texel_sums *out)
+{
+    fit_and_add(s, w, texel, most_views, theta, albedo, scale, out);
+}
+
+void texel_fit(const struct texel_scene *s, struct texel_worker *w, int texel, int most_views, const float theta[DISNEY_N],
+               float albedo[3], double scale, struct texel_sums *out)
+{
+    const int n = fit_and_add(s, w, texel, most_views, theta, albedo, scale, out);
     for (int c = 0; n && c < 3; c++) {
         float A[N_COLUMNS][STRIDE] = { { 0 } };
         for (int k = 0; k < n; k++) {

@@ -43,6 +43,9 @@ struct texel_sums {
 // without light, gives zeros. Adds `scale` times the sums.
 void texel_fit(const struct texel_scene *s, struct texel_worker *w, int texel, int most_views, const float theta[DISNEY_N],
                float albedo[3], double scale, struct texel_sums *out);
+// The same where theta stays as it is: only the albedo, cost, distance and n.
+void texel_fit_albedo(const struct texel_scene *s, struct texel_worker *w, int texel, int most_views, const float theta[DISNEY_N],
+                      float albedo[3], double scale, struct texel_sums *out);
 // The same cost at a fixed albedo, without derivatives; and for the RMSE of SOLVER.md 5 the sum of |clip(L) - clip(o)|^2, clip to [0,1].
 struct texel_error {
     double cost, squares;
