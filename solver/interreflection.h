@@ -4,6 +4,26 @@
 #include "solver/rays.h"
 #include "solver/texels.h"
 
+#include <math.h>
+
+// What a texel sends on of indirect light, as radiance: own x albedo + constant. As of light from all around: metal and diffuse base send back their
+// colour, the dielectric's surface what it reflects head-on.
+static inline float indirect_own(float irradiance)
+{
+    return irradiance * (float)M_1_PI;
+}
+
+static inline float indirect_constant(float irradiance, const float theta[DISNEY_N])
+{
+    return indirect_own(irradiance) * .08f * theta[DISNEY_SPECULAR] * (1 - theta[DISNEY_METALLIC]);
+}
+
+static inline void indirect_constant_gradient(float irradiance, const float theta[DISNEY_N], float *by_specular, float *by_metallic)
+{
+    *by_specular = indirect_own(irradiance) * .08f * (1 - theta[DISNEY_METALLIC]);
+    *by_metallic = -indirect_own(irradiance) * .08f * theta[DISNEY_SPECULAR];
+}
+
 struct interreflection {
     const struct texels *texels;
     const struct mesh *mesh;

@@ -832,6 +832,8 @@ int materials_solve(struct materials *out, const struct materials_input *in, con
         if (!err)
             check_energy(&e, &m);
     }
+    m.indirect = (float(*)[3])e.scene.indirect;
+    e.scene.indirect = NULL;
     estimate_free(&e);
     if (err)
         materials_free(&m);
@@ -848,6 +850,7 @@ void materials_free(struct materials *m)
     free(m->validity);
     free(m->coverage);
     free(m->region);
+    free(m->indirect);
     memset(m, 0, sizeof(*m));
 }
 

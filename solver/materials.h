@@ -67,6 +67,7 @@ struct materials {
     uint8_t *validity;          // [n_texels] enum materials_validity
     uint16_t *coverage;         // [n_texels] samples that were fitted
     uint8_t *region;            // [n_texels]
+    float (*indirect)[3];       // [n_texels] irradiance from the object itself; NULL without bounces
     struct regions regions;
     int n_levels;
     struct materials_level level[20];

@@ -24,8 +24,8 @@ static int measure_aside(struct stage1 *s, const uint8_t *aside, double *percent
 }
 
 int relocate_lights(struct photometric_state *state, const struct texels *texels, const struct samples *samples, const struct rays *rays,
-                    const uint8_t *hold_out, const float (*theta)[DISNEY_N], const struct joint_settings *settings,
-                    double *error_before, double *error_after)
+                    const uint8_t *hold_out, const float (*theta)[DISNEY_N], const float (*indirect)[3],
+                    const struct joint_settings *settings, double *error_before, double *error_after)
 {
     const int n_views = samples->n_views;
     struct joint_settings set = *settings;
@@ -35,7 +35,7 @@ int relocate_lights(struct photometric_state *state, const struct texels *texels
     uint8_t *fit = calloc((size_t)n_views + 1, 1), *aside = calloc((size_t)n_views + 1, 1);
     struct photometric p = { .texels = texels, .samples = samples, .model = REFLECT_DISNEY, .variant = set.variant, .albedo = ALBEDO_FREE,
                              .group_of_light = group, .n_groups = group ? lights_number_distances(&state->lights, group) : 0, .use_view = fit, .texel_step = 1, .n_threads = set.n_threads,
-                             .theta_of_texel = theta };
+                             .theta_of_texel = theta, .indirect = indirect };
     int err = group && fit && aside ? 0 : -ENOMEM;
     for (int v = 0, seen = 0; !err && v < n_views; v++)
         if (!(hold_out && hold_out[v])) {

@@ -191,34 +191,25 @@ int solve_read_lights(struct joint_result *out, struct lights *lights, const str
 
 // ---- shadows ------------------------------------------------------------------------------------------------------------
 
-// The cut's regions under the pose and distances of the moment: what soft shadows draw their directions from.
-static struct lights with_regions(const struct lights *cut, const struct lights *now)
-{
-    struct lights l = *now; // borrows
-    l.region = cut->region, l.panorama_width_px = cut->panorama_width_px, l.panorama_height_px = cut->panorama_height_px;
-    return l;
-}
-
 // Directions to each light, all together about as many for any number of lights; 1: hard shadows.
-static int sub_directions(const struct lights *cut, const struct inputs *in)
+static int sub_directions(const struct lights *l, const struct inputs *in)
 {
-    const int64_t n_bytes = (int64_t)in->texels.n * cut->n;
-    const bool known = cut->region && in->panorama.image.data && cut->panorama_width_px == in->panorama.image.width &&
-                       cut->panorama_height_px == in->panorama.image.height;
+    const int64_t n_bytes = (int64_t)in->texels.n * l->n;
+    const bool known = l->region && in->panorama.image.data && l->panorama_width_px == in->panorama.image.width &&
+                       l->panorama_height_px == in->panorama.image.height;
     if (known && n_bytes > most_soft_bytes)
-        log_info("materials: hard shadows: soft ones of %d texels and %d lights would take %.1f GiB", in->texels.n, cut->n,
+        log_info("materials: hard shadows: soft ones of %d texels and %d lights would take %.1f GiB", in->texels.n, l->n,
                  (double)n_bytes / (1 << 30));
-    return !known || n_bytes > most_soft_bytes ? 1 : cut->n <= 256 ? 16 : cut->n <= 512 ? 8 : 4;
+    return !known || n_bytes > most_soft_bytes ? 1 : l->n <= 256 ? 16 : l->n <= 512 ? 8 : 4;
 }
 
 // ---- the stage ----------------------------------------------------------------------------------------------------------
 
 int solve_find_materials(struct materials *out, const struct solve_materials *set, struct joint_result *stage1,
-                         const struct lights *cut, const struct joint_settings *joint, const struct inputs *in, const struct samples *samples,
-                         const uint8_t *held_out, int n_threads)
+                         const struct joint_settings *joint, const struct inputs *in, const struct samples *samples, const uint8_t *held_out,
+                         int n_threads)
 {
     struct light_visibility visibility = { 0 };
-    struct lights lights = with_regions(cut, &stage1->state.lights);
     const enum method method = joint->method;
     const int n_relocations = set->n_relocations >= 0 ? set->n_relocations : set->lights_from || method != METHOD_JOINT ? 0 : 2;
     struct materials_settings settings = method == METHOD_JOINT ? materials_defaults() : materials_paper();
@@ -236,7 +227,7 @@ int solve_find_materials(struct materials *out, const struct solve_materials *se
         settings.w_parent = set->w_parent;
     int err = 0;
     if (method == METHOD_JOINT && !set->no_visibility) {
-        err = light_visibility_trace(&visibility, in->rays, &in->texels, &lights, &in->panorama, sub_directions(cut, in), 1, n_threads);
+        err = light_visibility_trace(&visibility, in->rays, &in->texels, &stage1->state.lights, &in->panorama, sub_directions(&stage1->state.lights, in), 1, n_threads);
         input.soft = visibility.soft;
         input.visible = visibility.bits, input.words_per_texel = visibility.words_per_texel;
     }
@@ -246,12 +237,11 @@ int solve_find_materials(struct materials *out, const struct solve_materials *se
         settings.most_size = set->most_size && set->most_size < 64 ? set->most_size : 64, settings.look = true;
         err = materials_solve(&look, &input, &settings);
         if (!err)
-            err = relocate_lights(&stage1->state, &in->texels, samples, in->rays, held_out, (const float(*)[DISNEY_N])look.theta, joint,
-                                  &before, &after);
+            err = relocate_lights(&stage1->state, &in->texels, samples, in->rays, held_out, (const float(*)[DISNEY_N])look.theta,
+                                  (const float(*)[3])look.indirect, joint, &before, &after);
         materials_free(&look);
-        lights = with_regions(cut, &stage1->state.lights);
         if (!err && visibility.bits)
-            err = light_visibility_refresh(&visibility, in->rays, &in->texels, &lights, &in->panorama, .5 * M_PI / 180, 1, n_threads);
+            err = light_visibility_refresh(&visibility, in->rays, &in->texels, &stage1->state.lights, &in->panorama, .5 * M_PI / 180, 1, n_threads);
         if (err > 0)
             err = 0; // so many lights were traced again
         log_debug("materials: lights again: views aside %.3f -> %.3f %%", before, after);

@@ -18,10 +18,10 @@ extern const struct argp solve_materials_argp; // child of solve's; its input is
 int solve_read_lights(struct joint_result *out, struct lights *lights, const struct solve_materials *set, const struct inputs *in,
                       const struct samples *samples, const uint8_t *held_out, enum method method, int n_threads);
 
-// Stage 2 from what stage 1 found; with n_relocations > 0 and n_groups of lights, the lights of stage1 once more under the materials, so often as that pays. cut: the
-// same lights as they were cut from the panorama; where they know their regions, shadows are soft.
+// Stage 2 from what stage 1 found; with n_relocations > 0 and n_groups of lights, the lights of stage1 once more under the materials, so often as that pays. Where
+// lights know their regions, shadows are soft.
 int solve_find_materials(struct materials *out, const struct solve_materials *set, struct joint_result *stage1,
-                         const struct lights *cut, const struct joint_settings *joint, const struct inputs *in, const struct samples *samples, const uint8_t *held_out,
+                         const struct joint_settings *joint, const struct inputs *in, const struct samples *samples, const uint8_t *held_out,
                          int n_threads);
 // albedo.exr, brdf.exr, std.exr (ten parameters, then albedo_R, albedo_G, albedo_B; infinite: nothing depends on it) and validity.exr (Y: 1 measured, .5 weak, 0
 // filled from neighbours; coverage: samples; region) into dir. 0 or -errno.
