@@ -215,8 +215,10 @@ int solve_find_materials(struct materials *out, const struct solve_materials *se
         err = light_visibility_trace(&visibility, in->rays, &in->texels, &stage1->state.lights, NULL, 1, 1, n_threads);
         input.visible = visibility.bits, input.words_per_texel = visibility.words_per_texel;
     }
+    const int n_bounces = settings.n_bounces;
     for (int round = 0; !err && round < n_relocations; round++) {
         struct materials look = { 0 };
+        settings.n_bounces = 0; // relocate_lights() knows of none
         double before, after;
         settings.most_size = set->most_size && set->most_size < 64 ? set->most_size : 64, settings.look = true;
         err = materials_solve(&look, &input, &settings);
@@ -232,7 +234,7 @@ int solve_find_materials(struct materials *out, const struct solve_materials *se
         if (!err && after > .97 * before)
             break;
     }
-    settings.most_size = set->most_size, settings.look = false;
+    settings.most_size = set->most_size, settings.look = false, settings.n_bounces = n_bounces;
     if (!err)
         err = materials_solve(out, &input, &settings);
     light_visibility_free(&visibility);
