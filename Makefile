@@ -11,7 +11,7 @@ BUILD := build$(if $(filter-out release,$(VARIANT)),/$(VARIANT))
 MACHINE := $(shell uname -m)
 
 # ---- packages (Debian 12; the same names in Debian 13) ----------------------------------------------------------------
-PACKAGES := gcc make pkg-config libopenexr-dev libembree-dev libassimp-dev libjansson-dev libtiff-dev libpng-dev libexpat1-dev liblapacke-dev libopenblas-dev libcmocka-dev perl help2man
+PACKAGES := gcc make pkg-config libopenexr-dev libembree-dev libassimp-dev libjansson-dev libtiff-dev libpng-dev libjpeg-dev libexpat1-dev liblapacke-dev libopenblas-dev libcmocka-dev perl help2man
 PACKAGES_FUZZ := clang libclang-rt-dev
 PACKAGES_BENCH := libceres-dev g++ gnuplot-nox
 
@@ -24,14 +24,14 @@ CFLAGS_ALL = -std=gnu11 -D_GNU_SOURCE $(FLAGS_$(VARIANT)) -Wall -Wextra -Wshadow
   -ffp-contract=off -ffile-prefix-map=$(CURDIR)=. -pthread -I. -I/usr/include/OpenEXR -I/usr/include/Imath \
   -DSTUDIORIG_VERSION='"$(VERSION)"' $(CFLAGS)
 EMBREE = $(shell test -e /usr/include/embree4/rtcore.h && echo embree4 || echo embree3)
-LIBS = -lOpenEXRCore -l$(EMBREE) -lassimp -ljansson -ltiff -lpng -lexpat -llapacke -lopenblas -lm
+LIBS = -lOpenEXRCore -l$(EMBREE) -lassimp -ljansson -ltiff -lpng -ljpeg -lexpat -llapacke -lopenblas -lm
 ifeq ($(MACHINE),x86_64)
 ISA_avx2 := -mavx2 -mfma -ffp-contract=fast
 ISA_avx512 := -mavx512f -mavx512dq -mavx512bw -mavx512vl -mfma -mprefer-vector-width=512 -ffp-contract=fast
 endif
 
 # ---- what is built ------------------------------------------------------------------------------------------------------
-TAKE := $(addprefix solver/take/,atomic_file.c image.c image_exr.c image_hdr.c image_png.c image_tiff.c json.c log.c progress.c take.c)
+TAKE := $(addprefix solver/take/,atomic_file.c image.c image_exr.c image_hdr.c image_jpeg.c image_png.c image_tiff.c json.c log.c progress.c take.c)
 SOLVER := $(addprefix solver/,alternating.c cameras.c cameras_bundler.c cameras_colmap.c cameras_format.c cameras_frame.c \
   cameras_meshroom.c cameras_metashape.c cameras_realitycapture.c compare.c csv.c disney.c emitters.c export.c export_glb.c \
   export_materialx.c export_obj.c gltf_brdf.c interreflection.c joint.c levels.c lights.c lm.c materials.c mesh.c mesh_gltf_floats.c mesh_import.c misfit.c normal_equations.c \
@@ -50,10 +50,10 @@ FUZZERS := cameras cameras_import csv exr hdr json lights mesh
 
 # ---- rules --------------------------------------------------------------------------------------------------------------
 object = $(patsubst %.c,$(BUILD)/obj/%.o,$(1))
-ifneq ($(filter test demo bench chart figure5 stability experiments,$(MAKECMDGOALS)),)
+ifneq ($(filter test demo bench chart figure5 figures stability experiments,$(MAKECMDGOALS)),)
 FIRST := deps # these install what is missing before the first file is compiled
 endif
-.PHONY: all deps deps-fuzz deps-bench test demo bench chart figure5 stability experiments fuzz check-includes man install clean help
+.PHONY: all deps deps-fuzz deps-bench test demo bench chart figure5 figures stability experiments fuzz check-includes man install clean help
 .DELETE_ON_ERROR:
 .SECONDARY:
 
@@ -136,6 +136,9 @@ chart: deps deps-bench $(BUILD)/tests/bench/chart_lights
 figure5: deps deps-bench $(BUILD)/tests/bench/figure5
 	@mkdir -p build/figure5 && $(BUILD)/tests/bench/figure5 build/figure5 >build/figure5/figure5.csv && gnuplot -e "out='build/figure5/figure5'" tests/bench/figure5.gp
 	@echo "figure5: build/figure5/figure5.csv .svg .png: the paper's Figure 5: w_sim x start x true lights"
+figures: deps deps-bench $(BUILD)/bin/rigsolve
+	@BIN=$(BUILD)/bin sh tests/bench/figures_materials.sh
+	@echo "figures: build/figures_materials/*.csv, *.svg: the paper's Figures 8 to 11"
 STABILITY_OPTIONS ?=
 stability: deps deps-bench $(BUILD)/tests/bench/stability_kernels $(BUILD)/tests/bench/stability_joint
 	@mkdir -p build/stability && $(BUILD)/tests/bench/stability_kernels >build/stability/kernels.csv && gnuplot -e "out='build/stability/kernels'" tests/bench/stability_kernels.gp

@@ -135,11 +135,6 @@ static uint8_t linear_byte(double v)
     return (uint8_t)lround(255 * fmin(fmax(v, 0), 1));
 }
 
-static uint8_t srgb_byte(double v)
-{
-    return linear_byte(v <= .0031308 ? 12.92 * v : 1.055 * pow(v, 1 / 2.4) - .055);
-}
-
 // Where a picture's three values come from; -1: none, byte 0.
 struct recipe {
     int from[3];
@@ -166,7 +161,7 @@ static int make_picture(struct export_job *job, int which, const struct texels *
     for (size_t i = 0; i < n; i++)
         for (int c = 0; c < 3; c++) {
             const double v = r->from[c] < 0 ? 0 : (double)fitted[i][r->from[c]] / scale;
-            p->pixels[i][c] = r->srgb ? srgb_byte(v) : linear_byte(v);
+            p->pixels[i][c] = r->srgb ? image_srgb_byte(v) : linear_byte(v);
         }
     if (which == PICTURE_ANISOTROPY)
         for (size_t i = 0; i < n; i++)

@@ -93,11 +93,6 @@ static uint8_t byte_of(double v)
     return (uint8_t)lround(255 * fmin(fmax(v, 0), 1));
 }
 
-static uint8_t srgb_byte(double v)
-{
-    return byte_of(v <= .0031308 ? 12.92 * v : 1.055 * pow(v, 1 / 2.4) - .055);
-}
-
 // <figure> with n_channels of bytes as a PNG; the caption is HTML.
 static int put_figure(FILE *f, const char *class, int width, int height, int n_channels, const uint8_t *pixels, const char *alt,
                       const char *caption)
@@ -177,8 +172,8 @@ static int put_view(FILE *f, const struct report_view *v, bool set_aside, double
         for (int c = 0; c < 3; c++) {
             const double difference = (double)render[c] - (double)input[c];
             const double clipped = fmin(fmax((double)render[c], 0), 1) - fmin(fmax((double)input[c], 0), 1);
-            bytes[3 * i + (size_t)c] = srgb_byte(exposure * (double)input[c]);
-            bytes[3 * (n + i) + (size_t)c] = srgb_byte(exposure * (double)render[c]);
+            bytes[3 * i + (size_t)c] = image_srgb_byte(exposure * (double)input[c]);
+            bytes[3 * (n + i) + (size_t)c] = image_srgb_byte(exposure * (double)render[c]);
             bytes[3 * (2 * n + i) + (size_t)c] = byte_of(inside ? .5 + 4 * exposure * difference : .5);
             sum += inside ? clipped * clipped : 0;
         }
@@ -232,7 +227,7 @@ static int put_map(FILE *f, const struct image *map, int channel, bool colour, d
         err = bytes ? 0 : -ENOMEM;
     }
     for (size_t i = 0; !err && i < (size_t)side * (size_t)side * (size_t)n; i++)
-        bytes[i] = colour ? srgb_byte((double)small.data[i] / most) : byte_of((double)small.data[i] / most);
+        bytes[i] = colour ? image_srgb_byte((double)small.data[i] / most) : byte_of((double)small.data[i] / most);
     snprintf(caption, sizeof(caption), "%s<br><small>%s</small>", name, note);
     if (!err)
         err = put_figure(f, "map", side, side, n, bytes, name, caption);
@@ -386,7 +381,7 @@ static void draw_lights(FILE *f, const struct drawing *d, const struct lights *l
         place(d, point_m, at);
         const bool far = !(l->inverse_distance[i] > 0) || 1 / l->inverse_distance[i] > far_m;
         fprintf(f, "<circle cx=\"%.1f\" cy=\"%.1f\" r=\"%.1f\" fill=\"#%02x%02x%02x\"%s/>\n", at[0], at[1],
-                1.5 + 40 * sqrt(energy(l, i) / total / 16), srgb_byte(c[0] / most), srgb_byte(c[1] / most), srgb_byte(c[2] / most),
+                1.5 + 40 * sqrt(energy(l, i) / total / 16), image_srgb_byte(c[0] / most), image_srgb_byte(c[1] / most), image_srgb_byte(c[2] / most),
                 far ? " class=\"far\"" : "");
     }
 }

@@ -84,7 +84,7 @@ static const struct panel relit_panels[N_PANELS] = {
 
 struct studio {
     const struct panel *panels;
-    bool uniform;
+    bool uniform;         // no panels: the walls alone, or a photographed room
     double unit_radiance; // of the dim walls
     struct lights lights;
     struct image panorama;
@@ -257,6 +257,41 @@ done:
     if (err)
         studio_free(s);
     return err;
+}
+
+// A photographed room on the cuboid's walls: cut into lights, each as far as the wall it is seen on.
+static int studio_from_panorama(struct studio *s, const struct synth_settings *settings, const char *path, const double centre_m[3],
+                                const double world_from_probe[9])
+{
+    struct panorama p;
+    double sum = 0;
+    *s = (struct studio){.uniform = true, .unit_radiance = 1};
+    int err = panorama_read(&p, path);
+    if (err)
+        return err;
+    err = lights_median_cut(&s->lights, &p, settings->n_true_lights);
+    if (err) {
+        panorama_free(&p);
+        return err;
+    }
+    memcpy(s->lights.centre_m, centre_m, 3 * sizeof(double));
+    memcpy(s->lights.world_from_probe, world_from_probe, 9 * sizeof(double));
+    for (int i = 0; i < s->lights.n; i++) {
+        double dir[3], at[2], r_m;
+        mat3_mul_vec(dir, world_from_probe, s->lights.dir_probe[i]);
+        meet_wall(centre_m, dir, at, &r_m);
+        s->lights.inverse_distance[i] = settings->directional ? 0 : 1 / r_m;
+        sum += luminance(s->lights.irradiance[i]);
+    }
+    const double scale = sphere_brightness * M_PI / sphere_albedo / (sum / 4);
+    for (int i = 0; i < s->lights.n; i++)
+        for (int c = 0; c < 3; c++)
+            s->lights.irradiance[i][c] *= scale;
+    const size_t n_values = (size_t)p.image.width * (size_t)p.image.height * (size_t)p.image.n_channels;
+    for (size_t i = 0; i < n_values; i++)
+        p.image.data[i] = (float)((double)p.image.data[i] * scale);
+    s->panorama = p.image;
+    return 0;
 }
 
 static void append_panel(struct json *list, int id, int wall, const double low[2],
@@ -488,6 +523,7 @@ static void vase_albedo(const double x[3], int region, double albedo[3])
 struct textures {
     int n_regions; // 0: Lambertian
     const struct region *region;
+    struct region own_region;
     struct image albedo, parameters, region_id; // parameters: none for Lambert
 };
 
@@ -496,12 +532,24 @@ static void textures_free(struct textures *t)
     image_free(&t->albedo), image_free(&t->parameters), image_free(&t->region_id);
 }
 
+struct own_pictures {
+    struct image colour, material; // no data: not given
+};
+
 struct paint_job {
     int data_set;
+    const struct own_pictures *own;
     struct textures *textures;
     const struct texels *texels;
     const double *centre_m;
 };
+
+// A picture at the texel's place in the atlas; 0 where there is no picture.
+static void picture_at(const struct image *picture, const struct texels *t, uint32_t pixel, float value[IMAGE_MAX_CHANNELS])
+{
+    const double u = ((double)(pixel % (uint32_t)t->size) + .5) / t->size, v = ((double)(pixel / (uint32_t)t->size) + .5) / t->size;
+    image_bilinear(picture, u * picture->width, v * picture->height, value);
+}
 
 static void paint_texels(void *arg, int64_t begin, int64_t end, int worker)
 {
@@ -514,10 +562,15 @@ static void paint_texels(void *arg, int64_t begin, int64_t end, int worker)
         int region = 0;
         for (int k = 0; k < 3; k++)
             x[k] = (job->texels->position_m[i][k] - job->centre_m[k]) / object_radius_m;
-        if (job->data_set == 5) {
+        if (job->data_set == SYNTH_OWN && job->own->colour.data) {
+            float rgb[IMAGE_MAX_CHANNELS];
+            picture_at(&job->own->colour, job->texels, job->texels->pixel[i], rgb);
+            for (int c = 0; c < 3; c++)
+                albedo[c] = (double)rgb[job->own->colour.n_channels < 3 ? 0 : c];
+        } else if (job->data_set == 5) {
             region = vase_region(x);
             vase_albedo(x, region, albedo);
-        } else if (job->data_set >= 3) {
+        } else if (job->data_set == 3 || job->data_set == 4) {
             clay_albedo(x, albedo);
         }
         for (int c = 0; c < 3; c++)
@@ -525,6 +578,12 @@ static void paint_texels(void *arg, int64_t begin, int64_t end, int worker)
         for (int k = 0; k < DISNEY_N && out->n_regions; k++)
             out->parameters.data[DISNEY_N * pixel + (size_t)k] =
                 (float)out->region[region].theta[k];
+        if (job->own->material.data) {
+            float value[IMAGE_MAX_CHANNELS];
+            float *theta = &out->parameters.data[DISNEY_N * pixel];
+            picture_at(&job->own->material, job->texels, job->texels->pixel[i], value);
+            theta[DISNEY_ROUGHNESS] = value[1], theta[DISNEY_METALLIC] = value[2];
+        }
         out->region_id.data[pixel] = (float)region;
     }
 }
@@ -535,11 +594,24 @@ static int make_textures(struct textures *out, const struct mesh *mesh,
     static const char *const id_name[] = {"Y"};
     const int size = s->texture_size;
     struct texels texels = {0};
-    *out = (struct textures){.n_regions = s->data_set < 3    ? 0
+    struct own_pictures own = {0};
+    *out = (struct textures){.own_region = {.name = "own"}, .n_regions = s->data_set < 3    ? 0
                                           : s->data_set == 5 ? MAX_REGIONS
                                                              : 1,
-                             .region = s->data_set == 5 ? vase_regions : paper_theta};
+                             .region = s->data_set == SYNTH_OWN ? &out->own_region
+                                       : s->data_set == 5       ? vase_regions
+                                                                : paper_theta};
+    for (int k = 0; k < DISNEY_N; k++)
+        out->own_region.theta[k] = (double)s->own_theta[k];
     int err = texels_rasterise(&texels, mesh, size);
+    if (!err && s->data_set == SYNTH_OWN && s->colour_path)
+        err = image_read_texture(&own.colour, s->colour_path, true);
+    if (!err && s->data_set == SYNTH_OWN && s->material_path)
+        err = image_read_texture(&own.material, s->material_path, false);
+    if (!err && own.material.data && own.material.n_channels < 3) {
+        log_error("synth: %s has %d channel(s); expected three: G is roughness, B metallic", s->material_path, own.material.n_channels);
+        err = -EINVAL;
+    }
     if (!err)
         err = image_new(&out->albedo, size, size, 3, NULL);
     if (!err)
@@ -548,7 +620,7 @@ static int make_textures(struct textures *out, const struct mesh *mesh,
         err = image_new(&out->parameters, size, size, DISNEY_N, disney_parameter_names);
     if (err)
         goto done;
-    struct paint_job job = {s->data_set, out, &texels, centre_m};
+    struct paint_job job = {s->data_set, &own, out, &texels, centre_m};
     parallel_for(s->n_threads, texels.n, 4096, paint_texels, &job);
     err = texels_fill_gutter(&texels, out->albedo.data, 3, GUTTER_PX);
     if (!err)
@@ -557,6 +629,7 @@ static int make_textures(struct textures *out, const struct mesh *mesh,
         err = texels_fill_gutter(&texels, out->parameters.data, DISNEY_N, GUTTER_PX);
 done:
     texels_free(&texels);
+    image_free(&own.colour), image_free(&own.material);
     if (err)
         textures_free(out);
     return err;
@@ -569,7 +642,8 @@ static int write_material(const struct textures *t, int data_set, const char *pa
     json_set_string(doc, "model", t->n_regions ? "disney" : "lambert");
     json_set_string(doc, "variant", disney_variant_name(DISNEY_2017));
     json_set_string(doc, "albedo",
-                    data_set < 3    ? ".5"
+                    data_set < 3            ? ".5"
+                    : data_set == SYNTH_OWN ? "as given"
                     : data_set == 5 ? "detailed, by region"
                                     : "smooth, coloured");
     for (int i = 0; i < t->n_regions; i++) {
@@ -587,6 +661,8 @@ static int write_material(const struct textures *t, int data_set, const char *pa
 }
 
 // ---- the take -----------------------------------------------------------------------------------
+
+static const char *const set_names[] = {"", "D1", "D2", "D3", "D4", "D5", "own"};
 
 // Where everything goes while it is made, and what it is made of.
 struct job {
@@ -643,14 +719,13 @@ static int write_view_list(const struct job *job, const char *name, int first)
 static int write_report(const struct job *job)
 {
     const struct synth_settings *s = job->settings;
-    char path[PATH_MAX], set[8];
+    char path[PATH_MAX];
     int err = path_of(job, path, "truth/report.json");
     if (err)
         return err;
-    snprintf(set, sizeof(set), "D%d", s->data_set);
     struct json *doc = json_object(), *inputs = json_object(), *render = json_object();
     json_set_string(doc, "method", "truth");
-    json_set_string(doc, "data_set", set);
+    json_set_string(doc, "data_set", set_names[s->data_set]);
     json_set_int(doc, "seed", (int64_t)s->seed);
     json_set_int(doc, "n_views", s->n_views);
     json_set_int(doc, "n_lights", s->n_true_lights);
@@ -743,9 +818,52 @@ static int take_pictures(struct job *job, const struct studio *studio,
     return err;
 }
 
+// Scaled to the size of the others, its longest way upright where it was: centred at object_m.
+static int own_mesh(struct mesh *out, const char *path, bool flip_v, const double object_m[3])
+{
+    struct mesh_check check;
+    int err = mesh_read(out, flip_v ? NULL : &check, path);
+    if (err)
+        return err;
+    for (int i = 0; flip_v && i < out->n_vertices; i++)
+        out->uv[i][1] = 1 - out->uv[i][1];
+    if (flip_v)
+        mesh_check_run(out, &check);
+    mesh_check_log(&check, out, path);
+    const char *dot = strrchr(path, '.');
+    const bool y_up = dot && (!strcasecmp(dot, ".glb") || !strcasecmp(dot, ".gltf"));
+    double middle[3], most = 0;
+    for (int k = 0; k < 3; k++)
+        middle[k] = (out->bounds_m[0][k] + out->bounds_m[1][k]) / 2;
+    for (int i = 0; i < out->n_vertices; i++) {
+        double d[3];
+        for (int k = 0; k < 3; k++)
+            d[k] = (double)out->position_m[i][k] - middle[k];
+        most = fmax(most, vec3_norm(d));
+    }
+    for (int i = 0; i < out->n_vertices; i++) {
+        double d[3], n[3];
+        for (int k = 0; k < 3; k++)
+            d[k] = ((double)out->position_m[i][k] - middle[k]) * object_radius_m / most, n[k] = (double)out->normal[i][k];
+        for (int k = 0; k < 3; k++) { // x, y, z with y up is x, -z, y with z up
+            const int from = y_up ? (k == 1 ? 2 : k == 2 ? 1 : 0) : k;
+            const double sign = y_up && k == 1 ? -1 : 1;
+            out->position_m[i][k] = (float)(object_m[k] + sign * d[from]), out->normal[i][k] = (float)(sign * n[from]);
+        }
+    }
+    for (int k = 0; k < 3; k++)
+        out->bounds_m[0][k] = INFINITY, out->bounds_m[1][k] = -INFINITY;
+    for (int i = 0; i < out->n_vertices; i++)
+        for (int k = 0; k < 3; k++) {
+            out->bounds_m[0][k] = fmin(out->bounds_m[0][k], (double)out->position_m[i][k]);
+            out->bounds_m[1][k] = fmax(out->bounds_m[1][k], (double)out->position_m[i][k]);
+        }
+    return 0;
+}
+
 static int prepare(struct job *job)
 {
-    static const char *const own_shape[6] = {"", "pebble", "pebble", "pebble", "knot", "vase"};
+    static const char *const own_shape[] = {"", "pebble", "pebble", "pebble", "knot", "vase", "pebble"};
     const struct synth_settings *s = job->settings;
     const char *name = s->shape ? s->shape : own_shape[s->data_set];
     int shape = 0;
@@ -759,12 +877,13 @@ static int prepare(struct job *job)
         .samples = s->samples,
         .shadows = s->data_set >= 4,
         .shadow_rays = SHADOW_RAYS,
-        .bounce_rays = s->data_set == 4 ? BOUNCE_RAYS : 0,
+        .bounce_rays = s->data_set == 4 || s->data_set == SYNTH_OWN ? BOUNCE_RAYS : 0,
         .bounce_texture = s->texture_size < BOUNCE_TEXTURE ? s->texture_size : BOUNCE_TEXTURE,
         .seed = s->seed,
         .n_threads = s->n_threads};
-    int err = shape_make(&job->mesh, shape, job->object_m, object_radius_m,
-                         shape == SHAPE_PEBBLE ? 40000 : 80000);
+    int err = s->data_set == SYNTH_OWN ? own_mesh(&job->mesh, s->mesh_path, s->flip_v, job->object_m)
+                                       : shape_make(&job->mesh, shape, job->object_m, object_radius_m,
+                                                    shape == SHAPE_PEBBLE ? 40000 : 80000);
     if (!err)
         err = rays_new(&job->rays, &job->mesh);
     if (!err)
@@ -774,11 +893,13 @@ static int prepare(struct job *job)
     if (!err)
         err = make_relit_cameras(&job->relit_cameras, s, job->object_m);
     if (!err)
-        err = studio_new(&job->studio, s, studio_panels, job->centre_m, job->world_from_probe,
-                         STREAM_LIGHTS);
+        err = s->panorama_path
+                  ? studio_from_panorama(&job->studio, s, s->panorama_path, job->centre_m, job->world_from_probe)
+                  : studio_new(&job->studio, s, studio_panels, job->centre_m, job->world_from_probe, STREAM_LIGHTS);
     if (!err)
-        err = studio_new(&job->relit, s, relit_panels, relit_probe_m, rough_world_from_probe,
-                         STREAM_RELIT_LIGHTS);
+        err = s->relit_panorama_path
+                  ? studio_from_panorama(&job->relit, s, s->relit_panorama_path, relit_probe_m, rough_world_from_probe)
+                  : studio_new(&job->relit, s, relit_panels, relit_probe_m, rough_world_from_probe, STREAM_RELIT_LIGHTS);
     return err;
 }
 
@@ -786,8 +907,7 @@ static int write_known(struct job *job)
 {
     const struct synth_settings *s = job->settings;
     char name[64], path[PATH_MAX];
-    snprintf(name, sizeof(name), "synthetic D%d, seed %llu", s->data_set,
-             (unsigned long long)s->seed);
+    snprintf(name, sizeof(name), "synthetic %s, seed %llu", set_names[s->data_set], (unsigned long long)s->seed);
     // A fixed date: equal settings give equal bytes.
     int err = take_create(job->dir, name, "2020-03-01T00:00:00Z", "ready");
     if (!err)
@@ -883,6 +1003,7 @@ struct synth_settings synth_defaults(int data_set)
         .texture_size = data_set == 5   ? 2048
                         : data_set >= 3 ? 512
                                         : 64,
+        .own_theta = {0, 0, .5f, .5f},
     };
 }
 
@@ -903,7 +1024,14 @@ static int check(const struct synth_settings *s)
         log_error("synth: no shape '%s'; there are pebble, vase, knot and bowl", s->shape);
         return -EINVAL;
     }
-    if (!in_range("the data set", s->data_set, 1, 5) ||
+    if (s->data_set == SYNTH_OWN && !s->mesh_path) {
+        log_error("synth: own needs a mesh");
+        return -EINVAL;
+    }
+    for (int k = 0; k < DISNEY_N; k++)
+        if (!in_range(disney_parameter_names[k], (double)s->own_theta[k], 0, 1))
+            return -EINVAL;
+    if (!in_range("the data set", s->data_set, 1, SYNTH_OWN) ||
         !in_range("the number of lights", s->n_true_lights, 16, LIGHTS_MAX) ||
         !in_range("the noise", s->noise, 0, 1) || !in_range("the width", s->width_px, 16, 8192) ||
         !in_range("the height", s->height_px, 16, 8192) ||
@@ -913,7 +1041,7 @@ static int check(const struct synth_settings *s)
         !in_range("the panorama's width", s->panorama_width_px, 32, 16384))
         return -EINVAL;
     const double n_pixels = (double)s->panorama_width_px * (s->panorama_width_px / 2);
-    if (s->panorama_width_px % 2 || n_pixels < (double)MIN_PIXELS_PER_LIGHT * s->n_true_lights) {
+    if ((!s->panorama_path || !s->relit_panorama_path) && (s->panorama_width_px % 2 || n_pixels < (double)MIN_PIXELS_PER_LIGHT * s->n_true_lights)) {
         log_error("synth: a panorama %d px wide cannot hold %d lights; it must be even and have %d "
                   "pixels per light",
                   s->panorama_width_px, s->n_true_lights, MIN_PIXELS_PER_LIGHT);

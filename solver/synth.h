@@ -13,6 +13,7 @@
 //   D3 as D2, Disney, theta = (.2 .2 .5 .6 .9 0 .3 .4 .2 .2), smooth coloured albedo
 //   D4 D3's material on the knot, with shadows and one bounce
 //   D5 vase of four materials with sharp borders and detailed albedo, with shadows
+//   own  a mesh and its textures, by others, scaled to the same size; with shadows and one bounce
 // Noise is Gaussian, added to every pixel before the camera clips at 1; negative values are kept.
 // "clip" is 1 where it clipped.
 //
@@ -23,8 +24,10 @@
 #include <stdbool.h>
 #include <stdint.h>
 
+enum { SYNTH_OWN = 6 };
+
 struct synth_settings {
-    int data_set;      // 1..5
+    int data_set;      // 1..5, or SYNTH_OWN
     uint64_t seed;     // lights' jitter, noise, probe rotation error
     int n_true_lights; // N^, 16 .. 65536
     double noise;      // standard deviation of Gaussian noise, in units of white (1.0); 0: none
@@ -37,6 +40,13 @@ struct synth_settings {
     bool uniform_cuboid;                  // every wall equally bright
     bool one_panel_missing_from_panorama; // stability experiments
     const char *shape;                    // NULL: the data set's own; else a name of shapes.h
+    const char *mesh_path;     // SYNTH_OWN: OBJ, PLY, glTF, GLB; Y is up in glTF and GLB, else Z
+    bool flip_v;               // the mesh's v runs the other way than its format says (mesh_check_log: "upside down")
+    const char *colour_path;   // its base colour (image_read_texture); NULL: grey .5
+    const char *material_path; // glTF's channels: G roughness, B metallic; NULL: of own_theta
+    float own_theta[10];       // in the order of disney.h
+    const char *panorama_path, *relit_panorama_path; // what shines from the cuboid's walls, seen from c, in place of its panels; then
+                                                     // n_true_lights is a power of two, and panorama_width_px the file's. NULL: panels
     bool final_float;                     // 32-bit views instead of half
     int n_threads;
 };

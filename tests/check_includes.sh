@@ -31,6 +31,7 @@ only_in() { # library, pattern of its headers, the one file
 }
 only_in OpenEXR 'openexr|Imath|Imf' solver/take/image_exr.c
 only_in libtiff 'tiff' solver/take/image_tiff.c
+only_in libjpeg 'jpeglib|turbojpeg' solver/take/image_jpeg.c
 only_in libpng 'png\.h' solver/take/image_png.c
 only_in jansson 'jansson' solver/take/json.c
 only_in assimp 'assimp' solver/mesh_import.c

@@ -23,6 +23,7 @@
 #include <sys/stat.h>
 #include <sys/wait.h>
 #include <tiffio.h>
+#include <jpeglib.h>
 #include <unistd.h>
 #include <cmocka.h>
 
@@ -1184,6 +1185,75 @@ static void what_is_no_picture_is_named(void **state)
     assert_logged("memory", "OpenEXR");
 }
 
+// ---- JPEG -----------------------------------------------------------------------------------
+
+static size_t write_jpeg(uint8_t **bytes, int side, int n_channels, const uint8_t *colour)
+{
+    struct jpeg_compress_struct jpeg;
+    struct jpeg_error_mgr manager;
+    unsigned long n = 0;
+    uint8_t row[3 * 64];
+    JSAMPROW rows[] = { row };
+    *bytes = NULL;
+    jpeg.err = jpeg_std_error(&manager);
+    jpeg_create_compress(&jpeg);
+    jpeg_mem_dest(&jpeg, bytes, &n);
+    jpeg.image_width = jpeg.image_height = (JDIMENSION)side;
+    jpeg.input_components = n_channels;
+    jpeg.in_color_space = n_channels == 3 ? JCS_RGB : JCS_GRAYSCALE;
+    jpeg_set_defaults(&jpeg);
+    jpeg_set_quality(&jpeg, 100, TRUE);
+    jpeg_start_compress(&jpeg, TRUE);
+    for (int i = 0; i < side; i++)
+        for (int c = 0; c < n_channels; c++)
+            row[i * n_channels + c] = colour[c];
+    while (jpeg.next_scanline < jpeg.image_height)
+        jpeg_write_scanlines(&jpeg, rows, 1);
+    jpeg_finish_compress(&jpeg);
+    jpeg_destroy_compress(&jpeg);
+    return n;
+}
+
+// A JPEG is never a view, but may be a texture; so may a PNG. What is colour has its curve undone.
+static void textures_come_from_eight_bits(void **state)
+{
+    (void)state;
+    static const uint8_t colour[3] = { 0, 55, 255 };
+    static const double linear[3] = { 0, .0382, 1 };
+    struct image image;
+    uint8_t *bytes;
+    const size_t n = write_jpeg(&bytes, 40, 3, colour);
+    write_all(scratch_path("texture.jpg"), (const char *)bytes, n);
+    assert_int_equal(image_write_png(scratch_path("texture.png"), 1, 1, 3, colour), 0);
+    for (int k = 0; k < 4; k++) {
+        const char *path = scratch_path(k % 2 ? "texture.jpg" : "texture.png");
+        const double tolerance = k % 2 ? .012 : 1e-4; // JPEG rounds
+        assert_int_equal(image_read_texture(&image, path, k < 2), 0);
+        assert_true(image.n_channels == 3 && image.width == (k % 2 ? 40 : 1) && image.height == image.width);
+        for (int i = 0; i < image.width * image.height; i++)
+            for (int c = 0; c < 3; c++)
+                assert_true(fabs((double)image.data[3 * i + c] - (k < 2 ? linear[c] : colour[c] / 255.)) < tolerance);
+        image_free(&image);
+    }
+    listen();
+    assert_int_equal(image_read(&image, scratch_path("texture.jpg")), -EINVAL);
+    assert_logged("JPEG", "not linear");
+    for (size_t cut = 2; cut < n; cut += n / 7) { // cut off
+        struct image_file file = { bytes, cut, "cut.jpg" };
+        listen();
+        if (image_read_jpeg(&image, &file) != -EINVAL)
+            fail_msg("the first %zu of %zu bytes were read", cut, n);
+        assert_logged("cut.jpg");
+    }
+    free(bytes);
+    const size_t n_grey = write_jpeg(&bytes, 64, 1, colour + 1);
+    assert_int_equal(image_read_jpeg(&image, &(struct image_file){ bytes, n_grey, "grey.jpg" }), 0);
+    assert_true(image.n_channels == 1 && image.width == 64 && fabs((double)image.data[64 * 64 - 1] - 55. / 255) < .004);
+    image_free(&image);
+    free(bytes);
+    unlink(scratch_path("texture.jpg")), unlink(scratch_path("texture.png"));
+}
+
 // ---- writing fails cleanly ------------------------------------------------------------------
 
 // In a child that may not write files over limit bytes: what a full disk does. 0 if image_write_*
@@ -1382,6 +1452,7 @@ int main(void)
         cmocka_unit_test(damaged_pixels_of_a_tiff_are_named_by_their_place),
         cmocka_unit_test(no_damaged_byte_crashes_a_reader),
         cmocka_unit_test(what_is_no_picture_is_named),
+        cmocka_unit_test(textures_come_from_eight_bits),
         cmocka_unit_test(a_write_that_fails_leaves_the_old_file_and_nothing_else),
         cmocka_unit_test(new_images_are_zeroed_named_and_limited),
         cmocka_unit_test(bilinear_is_exact_at_centres_linear_between_and_clamped),

@@ -542,6 +542,122 @@ static void a_studio_that_cannot_be_written_leaves_nothing(void **state)
     assert_int_equal(count_entries(dir), 0);
 }
 
+// An object of others' making, far away and of another size.
+static void write_egg(const char *path)
+{
+    struct mesh mesh;
+    static const double middle[3] = {0, 0, 0};
+    assert_int_equal(shape_make(&mesh, SHAPE_PEBBLE, middle, 1, 2000), 0);
+    for (int i = 0; i < mesh.n_vertices; i++) {
+        mesh.position_m[i][0] = 5 + 2 * mesh.position_m[i][0];
+        mesh.position_m[i][2] = .5f * mesh.position_m[i][2];
+    }
+    assert_int_equal(mesh_write_obj(&mesh, path), 0);
+    mesh_free(&mesh);
+}
+
+static void own_objects_are_scaled_centred_and_painted(void **state)
+{
+    (void)state;
+    char path[PATH_MAX], mesh_path[PATH_MAX], colour_path[PATH_MAX], material_path[PATH_MAX];
+    struct synth_settings s = small(SYNTH_OWN);
+    struct mesh mesh;
+    struct image albedo, brdf;
+    double most = 0, middle[3];
+    static const uint8_t colour[2 * 3] = {255, 188, 0, 10, 0, 128}, material[2 * 3] = {0, 51, 255, 0, 204, 0};
+    write_egg(in_dir(mesh_path, "egg.obj"));
+    assert_int_equal(image_write_png(in_dir(colour_path, "colour.png"), 1, 2, 3, colour), 0);
+    assert_int_equal(image_write_png(in_dir(material_path, "material.png"), 1, 2, 3, material), 0);
+    log_set_level(LOG_ERROR);
+    s.mesh_path = mesh_path, s.colour_path = colour_path, s.material_path = material_path;
+    s.own_theta[DISNEY_SHEEN] = .25f;
+    make(&s, "own");
+    s.flip_v = true;
+    make(&s, "flipped");
+    assert_int_equal(mesh_read(&mesh, NULL, in_dir(path, "own/geometry/mesh.obj")), 0);
+    for (int k = 0; k < 3; k++)
+        middle[k] = (mesh.bounds_m[0][k] + mesh.bounds_m[1][k]) / 2;
+    for (int i = 0; i < mesh.n_vertices; i++)
+        most = fmax(most, hypot(hypot(mesh.position_m[i][0] - middle[0], mesh.position_m[i][1] - middle[1]),
+                                mesh.position_m[i][2] - middle[2]));
+    assert_true(fabs(most - .3) < 1e-5);
+    assert_true(fabs(middle[0] - .35) < 1e-5 && fabs(middle[1] - .25) < 1e-5 && fabs(middle[2] - 1.1) < 1e-5);
+    // its longest way is still along x, its shortest along z: OBJ is taken as it is
+    assert_true(mesh.bounds_m[1][0] - mesh.bounds_m[0][0] > 1.5 * (mesh.bounds_m[1][1] - mesh.bounds_m[0][1]));
+    assert_true(mesh.bounds_m[1][1] - mesh.bounds_m[0][1] > 1.5 * (mesh.bounds_m[1][2] - mesh.bounds_m[0][2]));
+    mesh_free(&mesh);
+    for (int flipped = 0; flipped < 2; flipped++) {
+        struct texels texels;
+        assert_int_equal(mesh_read(&mesh, NULL, in_dir(path, flipped ? "flipped/geometry/mesh.obj" : "own/geometry/mesh.obj")), 0);
+        assert_int_equal(texels_rasterise(&texels, &mesh, s.texture_size), 0);
+        assert_int_equal(image_read(&albedo, in_dir(path, flipped ? "flipped/truth/albedo.exr" : "own/truth/albedo.exr")), 0);
+        assert_int_equal(image_read(&brdf, in_dir(path, flipped ? "flipped/truth/brdf.exr" : "own/truth/brdf.exr")), 0);
+        int n[2] = {0};
+        for (int i = 0; i < texels.n; i++) {
+            const size_t at = texels.pixel[i];
+            const int row = (int)at / s.texture_size;
+            const bool top = row < s.texture_size / 4;
+            if (!top && row < s.texture_size - s.texture_size / 4)
+                continue; // between the two pixels' centres they mix
+            n[top]++;
+            const float *c = albedo.data + 3 * at, *theta = brdf.data + DISNEY_N * at;
+            assert_true(fabs((double)c[0] - (top ? 1 : .0030353)) < 1e-5 && fabs((double)c[1] - (top ? .5028865 : 0)) < 1e-5);
+            assert_true(fabs((double)theta[DISNEY_ROUGHNESS] - (top ? .2 : .8)) < 1e-5);
+            assert_true(fabs((double)theta[DISNEY_METALLIC] - (top ? 1 : 0)) < 1e-5);
+            assert_true(theta[DISNEY_SHEEN] == .25f && theta[DISNEY_SPECULAR] == .5f);
+        }
+        assert_true(n[0] > 20 && n[1] > 20);
+        image_free(&albedo), image_free(&brdf), texels_free(&texels), mesh_free(&mesh);
+    }
+    s.mesh_path = NULL;
+    log_set_level(LOG_SILENT);
+    assert_int_equal(synth_write(&s, in_dir(path, "none")), -EINVAL);
+    s.mesh_path = mesh_path, s.own_theta[0] = 1.5f;
+    assert_int_equal(synth_write(&s, in_dir(path, "none")), -EINVAL);
+    s.own_theta[0] = 0, s.material_path = "no such picture";
+    assert_int_equal(synth_write(&s, in_dir(path, "none")), -ENOENT);
+}
+
+// A photographed room: what the panorama shows is what shines, from the walls of the cuboid.
+static void a_panorama_may_light_the_studio(void **state)
+{
+    (void)state;
+    char path[PATH_MAX], room[PATH_MAX];
+    struct image photo;
+    struct panorama shown;
+    struct lights lights;
+    struct synth_settings s = small(3);
+    double total[3], sum[3] = {0}, luminance = 0;
+    assert_int_equal(image_new(&photo, 128, 64, 3, NULL), 0);
+    for (int i = 0; i < 3 * 128 * 64; i++)
+        photo.data[i] = 7.f + (float)(i % 3) + ((i / 3) % 128 > 100 && i < 3 * 128 * 20 ? 900.f : 0);
+    assert_int_equal(image_write_exr(&photo, in_dir(room, "room.exr"), IMAGE_FLOAT, IMAGE_ZIP), 0);
+    image_free(&photo);
+    s.panorama_path = room, s.n_true_lights = 512;
+    make(&s, "lit");
+    read_lights(&lights, "lit/truth/lights.json");
+    assert_int_equal(panorama_read(&shown, in_dir(path, "lit/panorama.exr")), 0);
+    panorama_total(&shown, total);
+    assert_int_equal(lights.n, 512);
+    for (int i = 0; i < lights.n; i++) {
+        double at[3];
+        mat3_mul_vec(at, lights.world_from_probe, lights.dir_probe[i]);
+        for (int c = 0; c < 3; c++) {
+            at[c] = at[c] / lights.inverse_distance[i] / (c == 0 ? 1.8 : c == 1 ? 1.2 : .6);
+            sum[c] += lights.irradiance[i][c];
+        }
+        assert_true(fabs(fmax(fmax(fabs(at[0]), fabs(at[1])), fabs(at[2])) - 1) < 1e-6); // on a wall, seen from c
+        luminance += .2126 * lights.irradiance[i][0] + .7152 * lights.irradiance[i][1] + .0722 * lights.irradiance[i][2];
+    }
+    for (int c = 0; c < 3; c++)
+        assert_true(fabs(sum[c] / total[c] - 1) < 1e-5);
+    assert_true(fabs(luminance / 4 * .5 / M_PI - .25) < 1e-6); // a sphere of albedo .5 is .25 bright
+    panorama_free(&shown), lights_free(&lights);
+    log_set_level(LOG_SILENT);
+    s.n_true_lights = 500;
+    assert_int_equal(synth_write(&s, in_dir(path, "none")), -EINVAL);
+}
+
 static void settings_out_of_range_are_refused(void **state)
 {
     (void)state;
@@ -549,7 +665,7 @@ static void settings_out_of_range_are_refused(void **state)
     in_dir(path, "take");
     log_set_level(LOG_SILENT);
     struct synth_settings s = small(1);
-    s.data_set = 6;
+    s.data_set = 7;
     assert_int_equal(synth_write(&s, path), -EINVAL);
     s = small(1), s.n_true_lights = 15;
     assert_int_equal(synth_write(&s, path), -EINVAL);
@@ -591,6 +707,8 @@ int main(void)
         TEST(the_same_seed_gives_the_same_bytes_with_any_threads),
         TEST(a_folder_in_use_is_refused_and_kept),
         TEST(a_studio_that_cannot_be_written_leaves_nothing),
+        TEST(own_objects_are_scaled_centred_and_painted),
+        TEST(a_panorama_may_light_the_studio),
         TEST(settings_out_of_range_are_refused),
     };
     return cmocka_run_group_tests(tests, NULL, NULL);

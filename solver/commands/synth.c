@@ -2,6 +2,7 @@
 #include "solver/commands/arguments.h"
 #include "solver/commands/commands.h"
 #include "solver/commands/output.h"
+#include "solver/disney.h"
 #include "solver/synth.h"
 #include "solver/take/json.h"
 #include "solver/take/log.h"
@@ -26,6 +27,13 @@ enum {
     KEY_SAMPLES,
     KEY_PANORAMA,
     KEY_FLOAT,
+    KEY_MESH,
+    KEY_FLIP_V,
+    KEY_COLOUR,
+    KEY_MATERIAL,
+    KEY_THETA,
+    KEY_LIGHT_FROM,
+    KEY_RELIGHT_FROM,
     KEY_THREADS,
     KEY_JSON
 };
@@ -47,8 +55,17 @@ static const struct argp_option options[] = {
     {"missing-panel", KEY_MISSING, 0, 0, "Leave one panel out of the panorama (it still shines)",
      0},
     {"float", KEY_FLOAT, 0, 0, "Views as 32-bit floats instead of half", 0},
-    {"threads", KEY_THREADS, "N", 0, "Default: all cores. The result does not depend on it", 0},
-    {"json", KEY_JSON, 0, 0, "Print the report (truth/report.json) on standard output", 0},
+    {0, 0, 0, 0, "Own objects and rooms", 1},
+    {"mesh", KEY_MESH, "FILE", 0, "own: OBJ, PLY, glTF or GLB with UVs; scaled to a radius of .3 m", 1},
+    {"flip-v", KEY_FLIP_V, 0, 0, "own: the mesh's v runs the other way than its format says", 1},
+    {"colour", KEY_COLOUR, "FILE", 0, "own: base colour (JPEG and PNG in sRGB, EXR and TIFF linear); default: grey", 1},
+    {"material", KEY_MATERIAL, "FILE", 0, "own: green is roughness, blue metallic, as in glTF", 1},
+    {"theta", KEY_THETA, "NAME=V,...", 0, "own: the other parameters (specular=.5,roughness=.5)", 1},
+    {"light-from", KEY_LIGHT_FROM, "FILE", 0, "A panorama that shines from the cuboid's walls, in place of panels", 1},
+    {"relight-from", KEY_RELIGHT_FROM, "FILE", 0, "Another one, for relit/", 1},
+    {0, 0, 0, 0, "", 2},
+    {"threads", KEY_THREADS, "N", 0, "Default: all cores. The result does not depend on it", 2},
+    {"json", KEY_JSON, 0, 0, "Print the report (truth/report.json) on standard output", 2},
     {0},
 };
 
@@ -57,6 +74,22 @@ struct arguments {
     const char *dir;
     bool json;
 };
+
+// name=value,...
+static void parse_theta(const struct argp_state *state, char *text, float theta[DISNEY_N])
+{
+    for (char *save, *word = strtok_r(text, ",", &save); word; word = strtok_r(NULL, ",", &save)) {
+        char *value = strchr(word, '=');
+        int p = 0;
+        if (value)
+            *value++ = 0;
+        while (p < DISNEY_N && strcmp(disney_parameter_names[p], word))
+            p++;
+        if (!value || p == DISNEY_N)
+            argp_error(state, "--theta: '%s' is not NAME=VALUE with a Disney parameter's name (roughness, specular, ...)", word);
+        theta[p] = (float)argument_number(state, "--theta", value, "a number", 0, 1);
+    }
+}
 
 static error_t parse(int key, char *text, struct argp_state *state)
 {
@@ -105,6 +138,27 @@ static error_t parse(int key, char *text, struct argp_state *state)
     case KEY_FLOAT:
         s->final_float = true;
         return 0;
+    case KEY_MESH:
+        s->mesh_path = text;
+        return 0;
+    case KEY_FLIP_V:
+        s->flip_v = true;
+        return 0;
+    case KEY_COLOUR:
+        s->colour_path = text;
+        return 0;
+    case KEY_MATERIAL:
+        s->material_path = text;
+        return 0;
+    case KEY_THETA:
+        parse_theta(state, text, s->own_theta);
+        return 0;
+    case KEY_LIGHT_FROM:
+        s->panorama_path = text;
+        return 0;
+    case KEY_RELIGHT_FROM:
+        s->relit_panorama_path = text;
+        return 0;
     case KEY_THREADS:
         s->n_threads = (int)argument_integer(state, "--threads", text, 1, 256);
         return 0;
@@ -112,14 +166,15 @@ static error_t parse(int key, char *text, struct argp_state *state)
         a->json = true;
         return 0;
     case ARGP_KEY_ARG:
-        if (s->data_set || strlen(text) != 2 || (text[0] != 'D' && text[0] != 'd') ||
-            text[1] < '1' || text[1] > '5')
-            argp_error(state, "'%s' is not one of D1, D2, D3, D4, D5 (one of them)", text);
-        s->data_set = text[1] - '0';
+        if (s->data_set || (strcmp(text, "own") && (strlen(text) != 2 || (text[0] != 'D' && text[0] != 'd') || text[1] < '1' || text[1] > '5')))
+            argp_error(state, "'%s' is not one of D1, D2, D3, D4, D5, own (one of them)", text);
+        s->data_set = !strcmp(text, "own") ? SYNTH_OWN : text[1] - '0';
         return 0;
     case ARGP_KEY_END:
         if (!s->data_set)
-            argp_error(state, "which data set? One of D1, D2, D3, D4, D5");
+            argp_error(state, "which data set? One of D1, D2, D3, D4, D5, own");
+        if (s->data_set == SYNTH_OWN ? !s->mesh_path : s->mesh_path || s->colour_path || s->material_path)
+            argp_error(state, "own needs --mesh, and only own takes --mesh, --colour and --material");
         if (!a->dir)
             argp_error(state, "where to? -o DIR is needed");
         return 0;
@@ -131,7 +186,7 @@ static error_t parse(int key, char *text, struct argp_state *state)
 static const struct argp argp = {
     options,
     parse,
-    "D1|D2|D3|D4|D5 -o DIR",
+    "D1|D2|D3|D4|D5 -o DIR\nown --mesh FILE -o DIR",
     "Make a synthetic studio: a take (views, mesh, cameras, panorama), its known answer in truth/, "
     "and views under another "
     "light in relit/.\v"
@@ -141,6 +196,7 @@ static const struct argp argp = {
     "  D3  as D2 with a Disney material and a coloured, smooth albedo\n"
     "  D4  D3's material on a knot, with shadows and one bounce\n"
     "  D5  vase of four materials with sharp borders, with shadows\n"
+    "  own a mesh and textures of yours, with shadows and one bounce\n"
     "A view is clipped at 1, and says where in its channel 'clip'. truth/ is for judging only: "
     "never give it to a solver.",
     0,

@@ -129,6 +129,26 @@ int image_read(struct image *out, const char *path)
     return err;
 }
 
+int image_read_texture(struct image *out, const char *path, bool is_colour)
+{
+    char *bytes;
+    size_t n;
+    *out = (struct image){ 0 };
+    int err = file_read(&bytes, &n, path, MAX_FILE_BYTES);
+    if (err)
+        return err;
+    const struct image_file file = { (const uint8_t *)bytes, n, path };
+    const bool jpeg = begins_with(&file, "\xff\xd8\xff", 3), curved = jpeg || begins_with(&file, "\x89PNG\r\n\x1a\n", 8);
+    err = jpeg ? image_read_jpeg(out, &file) : image_read_memory(out, &file);
+    free(bytes);
+    const size_t n_values = err || !curved || !is_colour ? 0 : (size_t)out->width * (size_t)out->height * (size_t)out->n_channels;
+    for (size_t i = 0; i < n_values; i++) {
+        const double v = (double)out->data[i];
+        out->data[i] = (float)(v <= .04045 ? v / 12.92 : pow((v + .055) / 1.055, 2.4));
+    }
+    return err;
+}
+
 int image_channel(const struct image *image, const char *name)
 {
     for (int c = 0; c < image->n_channels; c++)
@@ -164,7 +184,7 @@ int image_require_finite(const struct image *image, const char *const *names, co
     return -EDOM;
 }
 
-static uint8_t srgb_byte(double linear)
+uint8_t image_srgb_byte(double linear)
 {
     if (!(linear > 0)) // NaN too
         return 0;
@@ -187,7 +207,7 @@ int image_write_png_srgb(const struct image *image, const char *path, double exp
     for (size_t i = 0; i < n_pixels; i++)
         for (int c = 0; c < n; c++)
             pixels[i * (size_t)n + (size_t)c] =
-                srgb_byte(gain * (double)image->data[i * (size_t)image->n_channels + (size_t)c]);
+                image_srgb_byte(gain * (double)image->data[i * (size_t)image->n_channels + (size_t)c]);
     const int err = image_write_png(path, image->width, image->height, n, pixels);
     free(pixels);
     return err;

@@ -31,6 +31,9 @@ void image_free(struct image *image); // NULL and zeroed allowed; leaves it zero
 // (DWAA/DWAB, B44, deep, multi-part ...: "re-save as ZIP"), -EFBIG (over the limits), -ENOMEM.
 int image_read(struct image *out, const char *path);
 
+// The same and JPEG, for what is painted on a surface: with is_colour, 8-bit formats' sRGB curve is undone (alpha too).
+int image_read_texture(struct image *out, const char *path, bool is_colour);
+
 int image_channel(const struct image *image, const char *name); // index, or -1
 
 // -EDOM, logged with the first bad pixel and their count, if any value of the named channels (a list that ends with NULL; names that
@@ -47,6 +50,7 @@ int image_write_exr(const struct image *image, const char *path, enum image_type
 int image_write_png(const char *path, int width, int height, int n_channels, const uint8_t *pixels);
 // The same as bytes in memory, malloc'd, for files that hold pictures. 0, -EINVAL, -ENOMEM (logged).
 int image_encode_png(uint8_t **bytes, size_t *n_bytes, int width, int height, int n_channels, const uint8_t *pixels);
+uint8_t image_srgb_byte(double linear); // the sRGB curve, rounded to 8 bits; NaN is 0
 // Tone-mapped PNG of the first three (or the only) channel: value * 2^exposure_ev, clipped, sRGB curve.
 int image_write_png_srgb(const struct image *image, const char *path, double exposure_ev);
 

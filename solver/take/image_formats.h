@@ -18,6 +18,7 @@ int image_read_memory(struct image *out, const struct image_file *file);
 
 int image_read_exr(struct image *out, const struct image_file *file);
 int image_read_hdr(struct image *out, const struct image_file *file);
+int image_read_jpeg(struct image *out, const struct image_file *file); // values / 255, no curve
 int image_read_png(struct image *out, const struct image_file *file);
 int image_read_tiff(struct image *out, const struct image_file *file);
 
