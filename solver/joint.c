@@ -331,7 +331,7 @@ end:
 // ---- the answer -----------------------------------------------------------------------------------------------------------
 
 // Standard deviations, and whether what is left of the pictures is more than noise.
-static int uncertainty(struct stage1 *s, struct joint_result *out)
+int stage1_uncertainty(struct stage1 *s, struct joint_result *out)
 {
     const size_t n = (size_t)s->layout.n;
     double *prior = calloc(n * n, sizeof(double)), deviation[n];
@@ -361,7 +361,7 @@ static int uncertainty(struct stage1 *s, struct joint_result *out)
     return err;
 }
 
-static void doubt(const struct stage1 *s, struct joint_result *out, int n_fit_views)
+void stage1_doubt(const struct stage1 *s, struct joint_result *out, int n_fit_views)
 {
     if (n_fit_views < 3)
         out->doubts |= DOUBT_FEW_VIEWS;
@@ -430,7 +430,7 @@ int joint_solve(struct joint_result *out, const struct texels *texels, const str
     }
     struct photometric_error e;
     if (!err)
-        err = uncertainty(&s, out);
+        err = stage1_uncertainty(&s, out);
     if (!err)
         err = stage1_measure(&s, &s.base, fit, &e);
     if (!err) {
@@ -443,7 +443,7 @@ int joint_solve(struct joint_result *out, const struct texels *texels, const str
         }
     }
     if (!err) {
-        doubt(&s, out, n_fit_views);
+        stage1_doubt(&s, out, n_fit_views);
         out->n_jacobians = s.n_jacobians;
         out->n_sweep_jacobians = s.n_sweep_jacobians;
         out->n_evaluations = s.n_evaluations;

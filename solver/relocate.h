@@ -11,3 +11,8 @@
 int relocate_lights(struct photometric_state *state, const struct texels *texels, const struct samples *samples, const struct rays *rays,
                     const uint8_t *hold_out, const float (*theta)[DISNEY_N], const float (*indirect)[3],
                     const struct joint_settings *settings, double *error_before, double *error_after);
+
+// Whether the lights are to be trusted, asked again under the materials: misfit, standard deviations (given the materials) and doubts of *result, whose
+// state stays. The doubts that no material can lift (few views, no information, mirrored) stay too. 0 or -ENOMEM.
+int relocate_doubt(struct joint_result *result, const struct texels *texels, const struct samples *samples, const struct rays *rays,
+                   const uint8_t *hold_out, const float (*theta)[DISNEY_N], const float (*indirect)[3], const struct joint_settings *settings);
