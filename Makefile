@@ -50,8 +50,7 @@ RIGSIM := $(RIGSIM_LIB) $(addprefix tests/rigsim/,main.c server.c server_faults.
 FUZZED := $(TAKE) $(addprefix solver/,cameras.c cameras_bundler.c cameras_colmap.c cameras_format.c cameras_meshroom.c \
   cameras_metashape.c cameras_realitycapture.c csv.c lights.c mesh.c mesh_gltf_floats.c mesh_import.c orientation.c panorama.c parallel.c \
   picture_size.c texels.c xml.c)
-TESTS := $(addprefix test_,alternating brdf cameras cameras_import compare csv disney emitters export gltf_brdf image joint json judge levels \
-  lights lm materials mesh misfit normal_equations orientation panorama parallel pcg photometric rays render report rigsim rigsim_wire samples shapes stability \
+TESTS := $(addprefix test_,alternating brdf cameras cameras_import compare csv disney emitters export gltf_brdf image joint json judge levels lights lm materials mesh misfit normal_equations orientation panorama parallel pcg photometric rays render report rigsim rigsim_wire samples shapes stability interreflection
   synth take texels vec3 visibility) check_kernels
 RIG_TESTS := $(addprefix test_,camera camera_worker config container control digest ingest manifest personality rig studios trigger)
 FUZZERS := cameras cameras_import csv exr hdr json lights mesh

@@ -117,7 +117,8 @@ static int sweep(const struct photometric *p, const struct lights *lights, const
 }
 
 // To gain less than this is to gain nothing (percent of white, root of the difference of squares): sampling the pictures, and lights that
-// are points, leave as much. And a quarter of what else the model lacks, as the best fit shows it.
+// are points, leave as much. And a quarter of what else the model lacks, as the best fit shows it; all of it where that is much (several
+// materials, say): lights would go anywhere to explain a little of it.
 static const double floor_percent = .045, floor_of_structure = .25;
 // A plane's lights are held on it this much harder than neighbours on one sphere, of which each has 8 at 1 / |dh_i - dh_j|^2 ~ 50.
 static const double plane_share = 400, plane_tolerance = .06;
@@ -210,7 +211,8 @@ static int continuation(struct stage1 *s, const uint8_t *aside)
             err = misfit_measure(&left, &s->p, &s->base);
         }
     if (!err) {
-        const double enough = hypot(best, hypot(floor_percent, 100 * floor_of_structure * left.structure));
+        const double lacking = (misfit_is_poor(&left) ? 1 : floor_of_structure) * left.structure;
+        const double enough = hypot(best, hypot(floor_percent, 100 * lacking));
         log_debug("joint: views set aside %.4f %% at best, %.4f %% is as good (structure %.4f %%)", best, enough, 100 * left.structure);
         for (chosen = 0; s->set->w_sim < 0 && error[chosen] > enough;)
             chosen++;
@@ -329,7 +331,7 @@ end:
 // ---- the answer -----------------------------------------------------------------------------------------------------------
 
 // Standard deviations, and whether what is left of the pictures is more than noise.
-static int uncertainty(struct stage1 *s, struct joint_result *out)
+int stage1_uncertainty(struct stage1 *s, struct joint_result *out)
 {
     const size_t n = (size_t)s->layout.n;
     double *prior = calloc(n * n, sizeof(double)), deviation[n];
@@ -359,7 +361,7 @@ static int uncertainty(struct stage1 *s, struct joint_result *out)
     return err;
 }
 
-static void doubt(const struct stage1 *s, struct joint_result *out, int n_fit_views)
+void stage1_doubt(const struct stage1 *s, struct joint_result *out, int n_fit_views)
 {
     if (n_fit_views < 3)
         out->doubts |= DOUBT_FEW_VIEWS;
@@ -428,7 +430,7 @@ int joint_solve(struct joint_result *out, const struct texels *texels, const str
     }
     struct photometric_error e;
     if (!err)
-        err = uncertainty(&s, out);
+        err = stage1_uncertainty(&s, out);
     if (!err)
         err = stage1_measure(&s, &s.base, fit, &e);
     if (!err) {
@@ -441,7 +443,7 @@ int joint_solve(struct joint_result *out, const struct texels *texels, const str
         }
     }
     if (!err) {
-        doubt(&s, out, n_fit_views);
+        stage1_doubt(&s, out, n_fit_views);
         out->n_jacobians = s.n_jacobians;
         out->n_sweep_jacobians = s.n_sweep_jacobians;
         out->n_evaluations = s.n_evaluations;

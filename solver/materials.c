@@ -20,7 +20,8 @@ enum {
     EVALUATE_CHUNK = 32, ROW_CHUNK = 2048,
     WEAK_SAMPLES = 8,
     ALL_TIED = (1 << DISNEY_N) - 1,
-    BOUNCE_RAYS = 64, BOUNCE_LOOKS = 3, // rays per texel; how often the albedo is found and light sent out again
+    BOUNCE_RAYS = 256, BOUNCE_SIZE = 256, // rays per place where indirect light is gathered; textures finer than this interpolate it
+    BOUNCE_LOOKS = 3,      // how often the albedo is found and light sent out again
 };
 static const double first_mu = 1e-3, least_mu = 1e-7, most_mu = 1e9;
 static const float settled = 5e-4f; // a smaller step is not worth looking at the samples again
@@ -445,6 +446,7 @@ static int estimate_new(struct estimate *e, const struct materials_input *in, co
     e->scene.texels = in->texels, e->scene.samples = s, e->scene.kernels = kernels_select(KERNELS_ALL);
     e->scene.variant = set->variant;
     e->scene.visible = in->visible, e->scene.words_per_texel = in->words_per_texel;
+    e->scene.soft = in->soft;
     e->scene.free_albedo = set->free_albedo, e->scene.weigh_grazing = set->weigh_grazing;
     uint8_t *use = calloc((size_t)s->n_views + 1, 1);
     e->scene.use_view = use;
@@ -815,8 +817,8 @@ static int bounce(struct estimate *e, const struct materials_input *in, struct m
         return -ENOMEM;
     }
     const struct interreflection light = { .texels = in->texels, .mesh = in->mesh, .rays = in->rays, .lights = &e->scene.lights, .kernels = e->scene.kernels,
-                                           .visible = in->visible, .words_per_texel = in->words_per_texel, .diffuse = (const float(*)[3])diffuse,
-                                           .n_rays = BOUNCE_RAYS, .n_threads = e->set->n_threads };
+                                           .visible = in->visible, .words_per_texel = in->words_per_texel, .soft = in->soft,
+                                           .diffuse = (const float(*)[3])diffuse, .n_rays = BOUNCE_RAYS, .size = BOUNCE_SIZE, .n_threads = e->set->n_threads };
     int err = 0;
     parallel_for(e->set->n_threads, m->n_texels, EVALUATE_CHUNK, fit_albedos, &j);
     for (int t = 0; t < m->n_texels; t++)
@@ -894,6 +896,8 @@ int materials_solve(struct materials *out, const struct materials_input *in, con
         if (!err)
             check_energy(&e, &m);
     }
+    m.indirect = (float(*)[3])e.scene.indirect;
+    e.scene.indirect = NULL;
     estimate_free(&e);
     if (err)
         materials_free(&m);
@@ -910,6 +914,7 @@ void materials_free(struct materials *m)
     free(m->validity);
     free(m->coverage);
     free(m->region);
+    free(m->indirect);
     memset(m, 0, sizeof(*m));
 }
 

@@ -38,6 +38,7 @@ struct materials_input {
     const struct lights *lights;
     const uint16_t *visible;        // [n_texels][words_per_texel], or NULL
     int words_per_texel;
+    const uint8_t *soft;            // [n_texels][lights->n] visible share x 255, in place of visible; or NULL
     const double *log_gain;         // [n_views], or NULL
     const double *inverse_distance_std; // [distances of the lights: lights_number_distances] 1/m, and of the centre: what stage 1 does not
     double centre_std_m[3];         // know of the lights is not known of the albedo either; or NULL, 0: they are known
@@ -68,6 +69,7 @@ struct materials {
     uint8_t *validity;          // [n_texels] enum materials_validity
     uint16_t *coverage;         // [n_texels] samples that were fitted
     uint8_t *region;            // [n_texels]
+    float (*indirect)[3];       // [n_texels] irradiance from the object itself; NULL without bounces
     struct regions regions;
     int n_levels;
     struct materials_level level[20];

@@ -1,6 +1,7 @@
 // solver/photometric.c - E_photo over samples: texels in parallel, each texel's samples together because they share lights and albedo.
 #include "solver/photometric.h"
 
+#include "solver/interreflection.h"
 #include "solver/normal_equations.h"
 #include "solver/parallel.h"
 #include "solver/vec3.h"
@@ -44,11 +45,17 @@ int photometric_state_new(struct photometric_state *out, const struct photometri
     const size_t n_texels = (size_t)p->texels->n;
     out->albedo = malloc(n_texels * sizeof(*out->albedo));
     out->log_gain = calloc((size_t)p->samples->n_views, sizeof(double));
-    if (!out->albedo || !out->log_gain || lights_new(&out->lights, lights->n)) {
+    const size_t n = (size_t)lights->n;
+    const int err = lights_new(&out->lights, lights->n);
+    if (!err && lights->region)
+        out->lights.region = malloc((n + 1) * sizeof(*lights->region));
+    if (!out->albedo || !out->log_gain || err || (lights->region && !out->lights.region)) {
         photometric_state_free(out);
         return -ENOMEM;
     }
-    const size_t n = (size_t)lights->n;
+    if (lights->region)
+        memcpy(out->lights.region, lights->region, n * sizeof(*lights->region));
+    out->lights.panorama_width_px = lights->panorama_width_px, out->lights.panorama_height_px = lights->panorama_height_px;
     memcpy(out->lights.dir_probe, lights->dir_probe, n * sizeof(*lights->dir_probe));
     memcpy(out->lights.irradiance, lights->irradiance, n * sizeof(*lights->irradiance));
     memcpy(out->lights.inverse_distance, lights->inverse_distance, n * sizeof(double));
@@ -279,6 +286,24 @@ static void material_of(const struct job *j, int texel, struct shade_material *m
         m->albedo[c] = j->p->albedo == ALBEDO_SHARED ? (float)j->s->shared_albedo[c] : j->s->albedo[texel][c];
 }
 
+static float indirect_of(const struct job *j, int texel, int c)
+{
+    return j->p->indirect ? j->p->indirect[texel][c] : 0;
+}
+
+// Into the radiance that the lights give.
+static void add_indirect(const struct job *j, int texel, const struct shade_material *m, struct shade_jacobian *d)
+{
+    for (int c = 0; c < 3; c++) {
+        const float E = indirect_of(j, texel, c), own = indirect_own(E);
+        float by_specular, by_metallic;
+        indirect_constant_gradient(E, m->theta, &by_specular, &by_metallic);
+        d->L[c] += indirect_constant(E, m->theta) + own * m->albedo[c];
+        d->own[c] += own, d->albedo[c][c] += own;
+        d->theta[c][DISNEY_METALLIC] += by_metallic, d->theta[c][DISNEY_SPECULAR] += by_specular;
+    }
+}
+
 // constant and own of every observation, for the tint of m's albedo; the gain is in.
 static void find_affine(const struct job *j, struct worker *w, int texel, const struct surface_point *point,
                         const struct shade_material *m, struct observation *seen, int n_seen)
@@ -289,14 +314,17 @@ static void find_affine(const struct job *j, struct worker *w, int texel, const 
         for (int k = 0; k < n_seen; k++)
             for (int c = 0; c < 3; c++) {
                 seen[k].constant[c] = 0;
-                seen[k].own[c] = seen[k].gain * E[c] * (float)M_1_PI;
+                seen[k].own[c] = seen[k].gain * (E[c] + indirect_of(j, texel, c)) * (float)M_1_PI;
             }
         return;
     }
     for (int k = 0; k < n_seen; k++) {
         j->kernels->shade_affine(seen[k].constant, seen[k].own, &w->lit, point, seen[k].v, m);
-        for (int c = 0; c < 3; c++)
-            seen[k].constant[c] *= seen[k].gain, seen[k].own[c] *= seen[k].gain;
+        for (int c = 0; c < 3; c++) {
+            const float indirect = indirect_of(j, texel, c);
+            seen[k].constant[c] = seen[k].gain * (seen[k].constant[c] + indirect_constant(indirect, m->theta));
+            seen[k].own[c] = seen[k].gain * (seen[k].own[c] + indirect_own(indirect));
+        }
     }
 }
 
@@ -532,9 +560,9 @@ static void add_texels(void *arg, int64_t begin, int64_t end, int worker, double
             float E[3];
             j->kernels->irradiance_setup(E, &setup, &j->lights, &point, visible_of(j->p, texel));
             for (int c = 0; c < 3; c++) {
-                const float k = m.albedo[c] * (float)M_1_PI;
-                d.own[c] = E[c] * (float)M_1_PI;
-                d.L[c] = k * E[c];
+                const float k = m.albedo[c] * (float)M_1_PI, all = E[c] + indirect_of(j, texel, c);
+                d.own[c] = all * (float)M_1_PI;
+                d.L[c] = k * all;
                 d.albedo[c][c] = d.own[c];
                 for (int i = 0; i < 3; i++)
                     setup.centre[c][i] *= k, setup.rotation[c][i] *= k;
@@ -553,8 +581,11 @@ static void add_texels(void *arg, int64_t begin, int64_t end, int worker, double
             constrained[c] = m.albedo[c] <= 0 || m.albedo[c] >= most_albedo;
         for (int k = 0; k < n_seen; k++) {
             struct observation *o = &w->seen[k];
-            if (!lambert)
+            if (!lambert) {
                 j->kernels->shade_setup(&d, &setup, &w->lit, &j->lights, &point, o->v, &m);
+                if (j->p->indirect)
+                    add_indirect(j, texel, &m, &d);
+            }
             for (int c = 0; c < 3; c++) {
                 o->own[c] = o->gain * d.own[c];
                 o->constant[c] = o->gain * d.L[c] - o->own[c] * m.albedo[c];

@@ -39,6 +39,7 @@ struct photometric {
     const float (*theta_of_texel)[DISNEY_N]; // [n_texels] in place of the state's theta, which then must not be free; NULL: one for all
     const uint16_t *visible;        // [n_texels][words], or NULL: everything
     int words_per_texel;
+    const float (*indirect)[3];     // [n_texels] irradiance that other surfaces send (interreflection.h), or NULL
     int n_threads;
 };
 

@@ -5,8 +5,14 @@
 #pragma once
 #include "solver/joint.h"
 
-// state: lights and albedo, in and out (lights of one group move together, their distances in the ratio they have); its log_gain stays. theta[n_texels]. The similarity term starts 100 times as heavy as first_w_sim and falls by
+// state: lights and albedo, in and out (lights of one group move together, their distances in the ratio they have); its log_gain stays. theta[n_texels]; indirect[n_texels]: irradiance from the
+// object itself (interreflection.h), or NULL. The similarity term starts 100 times as heavy as first_w_sim and falls by
 // decades as long as views set aside gain. error_before, error_after: RMSE of those views in percent. 0 or -ENOMEM.
 int relocate_lights(struct photometric_state *state, const struct texels *texels, const struct samples *samples, const struct rays *rays,
-                    const uint8_t *hold_out, const float (*theta)[DISNEY_N], const struct joint_settings *settings,
-                    double *error_before, double *error_after);
+                    const uint8_t *hold_out, const float (*theta)[DISNEY_N], const float (*indirect)[3],
+                    const struct joint_settings *settings, double *error_before, double *error_after);
+
+// Whether the lights are to be trusted, asked again under the materials: misfit, standard deviations (given the materials) and doubts of *result, whose
+// state stays. The doubts that no material can lift (few views, no information, mirrored) stay too. 0 or -ENOMEM.
+int relocate_doubt(struct joint_result *result, const struct texels *texels, const struct samples *samples, const struct rays *rays,
+                   const uint8_t *hold_out, const float (*theta)[DISNEY_N], const float (*indirect)[3], const struct joint_settings *settings);

@@ -54,5 +54,10 @@ int stage1_measure(const struct stage1 *s, const struct photometric_state *state
 // The texel step that leaves about n_samples; odd, so as not to fall in step with the texture's rows.
 int stage1_step_for(const struct stage1 *s, int64_t n_samples);
 
+// Of what is found (joint.c): standard deviations, misfit and objective at base over the views in s->p, albedo solved; inverse_distance_std has room for
+// s->p.n_groups. Then why that is to be doubted, but for what only the search knows: bits are added.
+int stage1_uncertainty(struct stage1 *s, struct joint_result *out);
+void stage1_doubt(const struct stage1 *s, struct joint_result *out, int n_fit_views);
+
 // The paper's alternation (alternating.c). fit[n_views]: 1 = fitted.
 int stage1_alternate(struct stage1 *s, const uint8_t *fit);

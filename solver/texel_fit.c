@@ -1,6 +1,7 @@
 // solver/texel_fit.c - one texel's samples against a reflectance.
 #include "solver/texel_fit.h"
 
+#include "solver/interreflection.h"
 #include "solver/packed.h"
 #include "solver/random.h"
 
@@ -73,6 +74,14 @@ void texel_worker_free(struct texel_worker *w)
 
 // ---- what is known of the texel -----------------------------------------------------------------------------------------
 
+// The lights that reach a texel.
+static void gather_lights(const struct texel_scene *s, struct texel_worker *w, int texel, const struct surface_point *point)
+{
+    const size_t t = (size_t)texel;
+    s->kernels->gather(&w->lit, &s->lights, point, s->visible && !s->soft ? s->visible + t * (size_t)s->words_per_texel : NULL,
+                       s->soft ? s->soft + t * (size_t)s->lights.n : NULL);
+}
+
 static void surface_of(struct surface_point *out, const struct texels *t, int texel)
 {
     memcpy(out->position_m, t->position_m[texel], sizeof(out->position_m));
@@ -111,13 +120,6 @@ static int observe(const struct texel_scene *s, struct texel_worker *w, int texe
     return n_used;
 }
 
-// Of light from all around: metal and diffuse base send back their colour, the dielectric's surface what it reflects head-on.
-static const float head_on = .08f;
-static float ambient_reflectance(const float theta[DISNEY_N], float albedo)
-{
-    return albedo + head_on * theta[DISNEY_SPECULAR] * (1 - theta[DISNEY_METALLIC]);
-}
-
 // Jacobians of the observations, and their residuals; gain and indirect light are in.
 static void shade(const struct texel_scene *s, struct texel_worker *w, int texel, int n, const float theta[DISNEY_N],
                   const float albedo[3])
@@ -127,20 +129,21 @@ static void shade(const struct texel_scene *s, struct texel_worker *w, int texel
     memcpy(m.theta, theta, sizeof(m.theta));
     memcpy(m.albedo, albedo, sizeof(m.albedo));
     surface_of(&point, s->texels, texel);
-    s->kernels->gather(&w->lit, &s->lights, &point,
-                       s->visible ? s->visible + (size_t)texel * (size_t)s->words_per_texel : NULL, NULL);
+    gather_lights(s, w, texel, &point);
     s->kernels->shade_jacobian_views(w->jacobian, n, &w->lit, &point, (const float(*)[3])w->v, &m);
     for (int k = 0; k < n; k++) {
         struct shade_jacobian *d = &w->jacobian[k];
         struct observation *o = &w->seen[k];
         for (int c = 0; c < 3; c++) {
             if (s->indirect) {
-                const float E = s->indirect[texel][c] * (float)M_1_PI, gloss = head_on * (1 - theta[DISNEY_METALLIC]);
-                d->L[c] += E * ambient_reflectance(theta, albedo[c]);
-                d->own[c] += E;
-                d->albedo[c][c] += E;
-                d->theta[c][DISNEY_METALLIC] -= E * head_on * theta[DISNEY_SPECULAR];
-                d->theta[c][DISNEY_SPECULAR] += E * gloss;
+                const float E = s->indirect[texel][c], own = indirect_own(E);
+                float by_specular, by_metallic;
+                indirect_constant_gradient(E, theta, &by_specular, &by_metallic);
+                d->L[c] += indirect_constant(E, theta) + own * albedo[c];
+                d->own[c] += own;
+                d->albedo[c][c] += own;
+                d->theta[c][DISNEY_METALLIC] += by_metallic;
+                d->theta[c][DISNEY_SPECULAR] += by_specular;
             }
             o->own[c] = o->gain * d->own[c];
             o->r[c] = o->gain * d->L[c] - o->o[c];
@@ -297,15 +300,14 @@ void texel_measure(const struct texel_scene *s, struct texel_worker *w, int texe
     memcpy(m.theta, theta, sizeof(m.theta));
     memcpy(m.albedo, albedo, sizeof(m.albedo));
     surface_of(&point, s->texels, texel);
-    s->kernels->gather(&w->lit, &s->lights, &point,
-                       s->visible ? s->visible + (size_t)texel * (size_t)s->words_per_texel : NULL, NULL);
+    gather_lights(s, w, texel, &point);
     for (int k = 0; k < n; k++) {
         struct observation *o = &w->seen[k];
         float L[3];
         s->kernels->shade(L, &w->lit, &point, w->v[k], &m);
         for (int c = 0; c < 3; c++) {
             if (s->indirect)
-                L[c] += s->indirect[texel][c] * (float)M_1_PI * ambient_reflectance(theta, albedo[c]);
+                L[c] += indirect_constant(s->indirect[texel][c], theta) + indirect_own(s->indirect[texel][c]) * albedo[c];
             L[c] *= o->gain;
             o->r[c] = L[c] - o->o[c];
             const float shown = fminf(fmaxf(L[c], 0), white) - fminf(fmaxf(o->o[c], 0), white);

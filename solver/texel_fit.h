@@ -18,6 +18,7 @@ struct texel_scene {
     enum disney_variant variant;
     const uint16_t *visible;      // [n_texels][words_per_texel], or NULL: every light reaches every texel above its horizon
     int words_per_texel;
+    const uint8_t *soft;          // [n_texels][lights.n] visible share x 255, in place of visible; or NULL
     const float *gain;            // [n_views] exposure factors, or NULL: 1
     const float (*indirect)[3];   // [n_texels] irradiance that other surfaces send, or NULL
     const uint8_t *use_view;      // [n_views] 0: left out

@@ -18,7 +18,8 @@
 #include <stdlib.h>
 #include <string.h>
 
-enum { CHUNK = 256, LEAST_SUB = 4, MOST_SUB = 16 };
+enum { CHUNK = 256, LEAST_SUB = 4, MOST_SUB = 16, SECTORS = 6 };
+static const double near_cos = .7071; // lights further apart than 45 degrees are no neighbours
 
 static void to_double(double out[3], const float in[3])
 {
@@ -203,6 +204,34 @@ static double moved_rad(const struct light_visibility *v, int i, const double pl
     return largest;
 }
 
+// ---- lights: who is whose neighbour in the sky ----
+
+// The nearest light in each of six sectors around each one: the edge of a shadow that crosses a light's region parts its centre from
+// that of a neighbour, or has not reached either. -1: nobody there, so nobody tells.
+static int32_t (*find_neighbours(const struct lights *l))[SECTORS]
+{
+    int32_t(*neighbour)[SECTORS] = malloc(((size_t)l->n + 1) * sizeof(*neighbour));
+    for (int i = 0; neighbour && i < l->n; i++) {
+        const double *d = l->dir_probe[i], axis[3] = { fabs(d[0]) < .6, fabs(d[0]) >= .6, 0 };
+        double x[3], y[3], nearest[SECTORS];
+        vec3_cross(x, axis, d);
+        vec3_normalise(x);
+        vec3_cross(y, d, x);
+        for (int k = 0; k < SECTORS; k++)
+            neighbour[i][k] = -1, nearest[k] = near_cos;
+        for (int j = 0; j < l->n; j++) {
+            const double cosine = vec3_dot(d, l->dir_probe[j]);
+            if (cosine < near_cos || cosine > 1 - 1e-12) // itself, or another in its place
+                continue;
+            const double turn = atan2(vec3_dot(y, l->dir_probe[j]), vec3_dot(x, l->dir_probe[j])) / (2 * M_PI);
+            const int k = (int)((turn + 1) * SECTORS) % SECTORS;
+            if (cosine > nearest[k])
+                nearest[k] = cosine, neighbour[i][k] = j;
+        }
+    }
+    return neighbour;
+}
+
 // ---- lights: tracing ----
 
 struct light_job {
@@ -213,6 +242,9 @@ struct light_job {
     int n_listed;
     const int *listed;      // the lights to trace
     const double (*dir)[3]; // [n_listed][n_sub] R dh, of every sub-direction
+    const double (*centre)[3];              // [n_lights] R dh
+    const int32_t (*neighbour)[SECTORS];    // [n_lights], or NULL: n_sub is 1
+    uint8_t *centres;                       // [workers][n_lights] enum seen
     _Atomic int64_t n_rays;
 };
 
@@ -224,39 +256,68 @@ static void towards_light(double u[3], const double rotated_dir[3], double q,
         u[c] = rotated_dir[c] + q * (centre_m[c] - x[c]);
 }
 
+enum seen { NOT_ASKED, BELOW, BLOCKED, SEEN };
+
+// From one texel to light i at R dh = rotated_dir.
+static enum seen look(const struct light_job *job, int i, const double rotated_dir[3], const double point[3], const double normal[3],
+                      const float start[3], int64_t *n_rays)
+{
+    const double q = job->lights->inverse_distance[i], from[3] = { (double)start[0], (double)start[1], (double)start[2] };
+    double u[3];
+    towards_light(u, rotated_dir, q, job->lights->centre_m, point);
+    if (!(vec3_dot(normal, u) > 0))
+        return BELOW;
+    towards_light(u, rotated_dir, q, job->lights->centre_m, from);
+    const float dir[3] = { (float)u[0], (float)u[1], (float)u[2] };
+    const float t_max = q > 0 ? (float)(1 / q - (double)rays_offset_m(job->rays) / vec3_norm(u)) : INFINITY;
+    ++*n_rays;
+    return rays_blocked(job->rays, start, dir, 0, t_max) ? BLOCKED : SEEN;
+}
+
+// Whether the edge of a shadow may cross light i's region. centre[n_lights]: what is known of the lights' centres; grows.
+static bool on_an_edge(const struct light_job *job, int i, uint8_t *centre, const double point[3], const double normal[3],
+                       const float start[3], int64_t *n_rays)
+{
+    for (int k = 0; k < SECTORS; k++) {
+        const int32_t j = job->neighbour[i][k];
+        if (j < 0)
+            return true;
+        if (centre[j] == NOT_ASKED)
+            centre[j] = (uint8_t)look(job, j, job->centre[j], point, normal, start, n_rays);
+        if (centre[j] != BELOW && centre[j] != centre[i])
+            return true;
+    }
+    return false;
+}
+
 static void trace_texels(void *arg, int64_t begin, int64_t end, int worker)
 {
-    (void)worker;
     struct light_job *job = arg;
     struct light_visibility *v = job->v;
     const struct texels *t = job->texels;
-    const float offset_m = rays_offset_m(job->rays);
+    uint8_t *centre = job->centres + (size_t)worker * (size_t)v->n_lights;
     int64_t n_rays = 0;
     for (int64_t i = begin; i < end; i++) {
-        double point[3], normal[3], from[3];
+        double point[3], normal[3];
         float start[3];
         to_double(point, t->position_m[i]);
         to_double(normal, t->normal[i]);
         rays_start(job->rays, t->triangle[i], t->barycentric[i], start);
-        to_double(from, start);
         uint16_t *bits = v->bits + i * v->words_per_texel;
+        memset(centre, NOT_ASKED, (size_t)v->n_lights);
         for (int k = 0; k < job->n_listed; k++) {
             const int light = job->listed[k];
-            const double q = job->lights->inverse_distance[light];
-            int n_above = 0, n_visible = 0;
-            for (int s = 0; s < v->n_sub; s++) {
-                const double *rotated_dir = job->dir[(int64_t)k * v->n_sub + s];
-                double u[3];
-                towards_light(u, rotated_dir, q, job->lights->centre_m, point);
-                if (!(vec3_dot(normal, u) > 0))
-                    continue;
-                towards_light(u, rotated_dir, q, job->lights->centre_m, from);
-                const float dir[3] = { (float)u[0], (float)u[1], (float)u[2] };
-                const float t_max = q > 0 ? (float)(1 / q - offset_m / vec3_norm(u)) : INFINITY;
-                n_above++;
-                n_visible += !rays_blocked(job->rays, start, dir, 0, t_max);
+            int n_above = 1, n_visible = 0;
+            if (centre[light] == NOT_ASKED)
+                centre[light] = (uint8_t)look(job, light, job->centre[light], point, normal, start, &n_rays);
+            n_visible = centre[light] == SEEN;
+            if (v->n_sub > 1 && (centre[light] == BELOW || on_an_edge(job, light, centre, point, normal, start, &n_rays))) {
+                n_above = n_visible = 0;
+                for (int s = 0; s < v->n_sub; s++) {
+                    const enum seen seen = look(job, light, job->dir[(int64_t)k * v->n_sub + s], point, normal, start, &n_rays);
+                    n_above += seen != BELOW, n_visible += seen == SEEN;
+                }
             }
-            n_rays += n_above;
             const unsigned bit = 1u << light % 16, word = bits[light / 16];
             bits[light / 16] = (uint16_t)(n_visible ? word | bit : word & ~bit);
             if (v->soft)
@@ -272,16 +333,21 @@ static int trace_listed(struct light_visibility *v, const struct rays *r, const 
                         const struct lights *l, const struct panorama *p, const int *listed,
                         int n_listed, uint64_t seed, int n_threads)
 {
-    double(*dir)[3] = malloc(((size_t)n_listed * (size_t)v->n_sub + 1) * sizeof(dir[0]));
-    if (!dir)
-        return -ENOMEM;
+    const size_t n_lights = (size_t)l->n + 1, n_workers = (size_t)(n_threads > 0 ? n_threads : parallel_n_cores());
+    double(*dir)[3] = v->n_sub > 1 ? malloc(((size_t)n_listed * (size_t)v->n_sub + 1) * sizeof(dir[0])) : NULL;
+    double(*centre)[3] = malloc(n_lights * sizeof(centre[0]));
+    uint8_t *centres = malloc(n_workers * n_lights);
+    int32_t(*neighbour)[SECTORS] = v->n_sub > 1 ? find_neighbours(l) : NULL;
+    int err = -ENOMEM;
+    if (!centre || !centres || (v->n_sub > 1 && (!dir || !neighbour)))
+        goto done;
+    for (int i = 0; i < l->n; i++)
+        mat3_mul_vec(centre[i], l->world_from_probe, l->dir_probe[i]);
     for (int k = 0; k < n_listed; k++) {
         double(*of_light)[3] = dir + (size_t)k * (size_t)v->n_sub;
-        if (v->n_sub == 1)
-            memcpy(of_light[0], l->dir_probe[listed[k]], sizeof(of_light[0]));
-        else
+        if (v->n_sub > 1)
             draw_sub_directions(of_light, l, listed[k], p, v->n_sub, seed);
-        for (int s = 0; s < v->n_sub; s++)
+        for (int s = 0; v->n_sub > 1 && s < v->n_sub; s++)
             mat3_mul_vec(of_light[s], l->world_from_probe, of_light[s]);
         v->traced_directional[listed[k]] =
             place_of_light(l, listed[k], v->traced_from_m[listed[k]]);
@@ -292,13 +358,21 @@ static int trace_listed(struct light_visibility *v, const struct rays *r, const 
                              .lights = l,
                              .n_listed = n_listed,
                              .listed = listed,
-                             .dir = (const double(*)[3])dir };
+                             .dir = (const double(*)[3])dir,
+                             .centre = (const double(*)[3])centre,
+                             .neighbour = (const int32_t(*)[SECTORS])neighbour,
+                             .centres = centres };
     progress_begin("trace lights", t->n);
     parallel_for(n_threads, t->n, CHUNK, trace_texels, &job);
     progress_end();
     v->n_rays += job.n_rays;
+    err = 0;
+done:
     free(dir);
-    return 0;
+    free(centre);
+    free(centres);
+    free(neighbour);
+    return err;
 }
 
 // Soft visibility draws from the pixels each light was cut from: are they all there?

@@ -454,7 +454,7 @@ int command_solve(int argc, char **argv)
         err = joint_solve(&result, &s.in.texels, &scene.samples, s.in.rays, &scene.lights, scene.held_out, &s.joint);
     const double materials_begin = wall_s();
     if (!err && s.materials.last_stage == 2 && s.joint.model == REFLECT_DISNEY && s.joint.albedo == ALBEDO_FREE)
-        err = solve_find_materials(&materials, &s.materials, &result, &s.joint, &s.in, &scene.samples, scene.held_out, s.n_threads);
+        err = solve_find_materials(&materials, &s.materials, &result, &scene.lights, &s.joint, &s.in, &scene.samples, scene.held_out, s.n_threads);
     if (!err) {
         const double now = wall_s();
         struct json *report = make_report(&scene, &s, &result, &materials, now - begin, materials_begin - stage_begin, now - materials_begin);

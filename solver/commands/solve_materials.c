@@ -15,7 +15,8 @@
 #include <sys/stat.h>
 #include <unistd.h>
 
-enum { KEY_STAGE = 0x20000, KEY_LIGHTS_FROM, KEY_W_REG, KEY_W_PARENT, KEY_NO_SEAMS, KEY_BOUNCES, KEY_NO_SELECTION, KEY_RELOCATE, KEY_PARAMETER_TEXTURE };
+static const int64_t most_soft_bytes = INT64_C(1) << 30;
+enum { KEY_STAGE = 0x20000, KEY_LIGHTS_FROM, KEY_W_REG, KEY_W_PARENT, KEY_NO_SEAMS, KEY_BOUNCES, KEY_NO_SELECTION, KEY_RELOCATE, KEY_PARAMETER_TEXTURE, KEY_MATERIAL_LIGHTS };
 
 static const struct argp_option options[] = {
     { 0, 0, 0, 0, "Materials", 4 },
@@ -27,6 +28,7 @@ static const struct argp_option options[] = {
     { "no-seams", KEY_NO_SEAMS, 0, 0, "charts of the atlas know nothing of each other", 4 },
     { "no-selection", KEY_NO_SELECTION, 0, 0, "every parameter is free at every texel", 4 },
     { "relocate", KEY_RELOCATE, "N", 0, "find the lights again under the materials, at most N times (joint: 2; with --lights-from: 0)", 4 },
+    { "material-lights", KEY_MATERIAL_LIGHTS, "N", 0, "point lights to shade the textures by (joint: 4096 if something is glossy, else those of stage 1)", 4 },
     { "bounces", KEY_BOUNCES, "N", 0, "light that the object sends to itself, as if diffuse: N bounces (joint: 1; else 0)", 4 },
     { 0 },
 };
@@ -63,6 +65,9 @@ static error_t parse(int key, char *text, struct argp_state *state)
         return 0;
     case KEY_RELOCATE:
         s->n_relocations = (int)argument_integer(state, "--relocate", text, 0, 10);
+        return 0;
+    case KEY_MATERIAL_LIGHTS:
+        s->n_lights = (int)argument_integer(state, "--material-lights", text, 1, LIGHTS_MAX);
         return 0;
     case KEY_BOUNCES:
         s->n_bounces = (int)argument_integer(state, "--bounces", text, 0, 10);
@@ -188,9 +193,76 @@ int solve_read_lights(struct joint_result *out, struct lights *lights, const str
     return err;
 }
 
+// ---- shadows ------------------------------------------------------------------------------------------------------------
+
+// Directions to each light, all together about as many for any number of lights; 1: hard shadows.
+static int sub_directions(const struct lights *l, const struct inputs *in)
+{
+    const int64_t n_bytes = (int64_t)in->texels.n * l->n;
+    const bool known = l->region && in->panorama.image.data && l->panorama_width_px == in->panorama.image.width &&
+                       l->panorama_height_px == in->panorama.image.height;
+    if (known && n_bytes > most_soft_bytes)
+        log_info("materials: hard shadows: soft ones of %d texels and %d lights would take %.1f GiB", in->texels.n, l->n,
+                 (double)n_bytes / (1 << 30));
+    return !known || n_bytes > most_soft_bytes ? 1 : l->n <= 256 ? 16 : l->n <= 512 ? 8 : 4;
+}
+
+// ---- the lights' number ---------------------------------------------------------------------------------------------------
+
+// Of points a glossy lobe would show each for itself (SOLVER.md 6: at roughness .2, 1024 are 1 % off, 4096 a third of that).
+enum { GLOSSY_LIGHTS = 4096 };
+static const float glossy_roughness = .25f, glossy_share = .01f;
+
+static bool is_glossy(const struct materials *m)
+{
+    int n = 0;
+    for (int t = 0; t < m->n_texels; t++)
+        n += m->theta[t][DISNEY_ROUGHNESS] < glossy_roughness;
+    return (float)n > glossy_share * (float)m->n_texels;
+}
+
+// The lights' regions once more in parts, at their distances: in `lights` and in stage1.
+static int cut_finer(struct joint_result *stage1, struct lights *lights, const struct inputs *in, int n)
+{
+    struct lights from = *lights, fine[2] = { { 0 }, { 0 } };
+    if (!lights->region || !lights->spread_rad || n <= lights->n || in->panorama.image.width != lights->panorama_width_px ||
+        in->panorama.image.height != lights->panorama_height_px)
+        return 0;
+    from.inverse_distance = stage1->state.lights.inverse_distance;
+    memcpy(from.centre_m, stage1->state.lights.centre_m, sizeof(from.centre_m));
+    memcpy(from.world_from_probe, stage1->state.lights.world_from_probe, sizeof(from.world_from_probe));
+    int err = 0, new_group = 0;
+    for (int i = 0; i < lights->n; i++)
+        new_group = lights->group[i] >= new_group ? lights->group[i] + 1 : new_group;
+    for (int k = 0; !err && k < 2; k++) {
+        err = lights_refine(&fine[k], &from, &in->panorama, n);
+        for (int i = 0; !err && i < fine[k].n; i++) { // a light without a group is now one of several: they are one
+            const int parent = fine[k].group[i];
+            fine[k].group[i] = lights->group[parent] >= 0 ? lights->group[parent] : new_group + parent;
+        }
+    }
+    if (err) {
+        lights_free(&fine[0]);
+        return err;
+    }
+    log_debug("materials: %d lights in place of %d", fine[0].n, lights->n);
+    lights_free(lights);
+    lights_free(&stage1->state.lights);
+    *lights = fine[0], stage1->state.lights = fine[1];
+    return 0;
+}
+
 // ---- the stage ----------------------------------------------------------------------------------------------------------
 
-int solve_find_materials(struct materials *out, const struct solve_materials *set, struct joint_result *stage1,
+static int trace(struct materials_input *input, struct light_visibility *v, const struct inputs *in, int n_threads)
+{
+    light_visibility_free(v);
+    const int err = light_visibility_trace(v, in->rays, &in->texels, input->lights, &in->panorama, sub_directions(input->lights, in), 1, n_threads);
+    input->soft = v->soft, input->visible = v->bits, input->words_per_texel = v->words_per_texel;
+    return err;
+}
+
+int solve_find_materials(struct materials *out, const struct solve_materials *set, struct joint_result *stage1, struct lights *lights,
                          const struct joint_settings *joint, const struct inputs *in, const struct samples *samples, const uint8_t *held_out,
                          int n_threads)
 {
@@ -212,22 +284,22 @@ int solve_find_materials(struct materials *out, const struct solve_materials *se
         settings.w_reg = set->w_reg;
     if (set->w_parent >= 0)
         settings.w_parent = set->w_parent;
-    int err = 0;
-    if (method == METHOD_JOINT && !set->no_visibility) {
-        err = light_visibility_trace(&visibility, in->rays, &in->texels, &stage1->state.lights, NULL, 1, 1, n_threads);
-        input.visible = visibility.bits, input.words_per_texel = visibility.words_per_texel;
-    }
+    const bool shadows = method == METHOD_JOINT && !set->no_visibility;
+    int n_lights = set->n_lights;
+    int err = shadows ? trace(&input, &visibility, in, n_threads) : 0;
     for (int round = 0; !err && round < n_relocations; round++) {
         struct materials look = { 0 };
         double before, after;
         settings.most_size = set->most_size && set->most_size < 64 ? set->most_size : 64, settings.look = true;
         err = materials_solve(&look, &input, &settings);
         if (!err)
-            err = relocate_lights(&stage1->state, &in->texels, samples, in->rays, held_out, (const float(*)[DISNEY_N])look.theta, joint,
-                                  &before, &after);
+            err = relocate_lights(&stage1->state, &in->texels, samples, in->rays, held_out, (const float(*)[DISNEY_N])look.theta,
+                                  (const float(*)[3])look.indirect, joint, &before, &after);
+        if (!err && !set->n_lights)
+            n_lights = is_glossy(&look) ? GLOSSY_LIGHTS : 0;
         materials_free(&look);
         if (!err && visibility.bits)
-            err = light_visibility_refresh(&visibility, in->rays, &in->texels, &stage1->state.lights, NULL, .5 * M_PI / 180, 1, n_threads);
+            err = light_visibility_refresh(&visibility, in->rays, &in->texels, &stage1->state.lights, &in->panorama, .5 * M_PI / 180, 1, n_threads);
         if (err > 0)
             err = 0; // so many lights were traced again
         log_debug("materials: lights again: views aside %.3f -> %.3f %%", before, after);
@@ -235,8 +307,16 @@ int solve_find_materials(struct materials *out, const struct solve_materials *se
             break;
     }
     settings.most_size = set->most_size, settings.look = false;
+    if (!err && n_lights > stage1->state.lights.n)
+        err = cut_finer(stage1, lights, in, n_lights);
+    if (!err && shadows && visibility.n_lights != stage1->state.lights.n)
+        err = trace(&input, &visibility, in, n_threads);
     if (!err)
         err = materials_solve(out, &input, &settings);
+    if (!err && n_relocations > 0)
+        err = relocate_doubt(stage1, &in->texels, samples, in->rays, held_out, (const float(*)[DISNEY_N])out->theta, (const float(*)[3])out->indirect, joint);
+    if (err)
+        materials_free(out);
     light_visibility_free(&visibility);
     return err;
 }

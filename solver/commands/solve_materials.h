@@ -8,7 +8,7 @@ struct solve_materials {
     int last_stage;          // --stage: 1 stops after the lights
     const char *lights_from; // --lights-from: a solve's folder or a lights.json; NULL: stage 1 finds them
     double w_reg, w_parent;  // negative: the method's own
-    int n_bounces, n_relocations, most_size;
+    int n_bounces, n_relocations, most_size, n_lights;
     bool no_seams, no_selection, no_visibility;
 };
 extern const struct argp solve_materials_argp; // child of solve's; its input is a struct solve_materials
@@ -18,8 +18,9 @@ extern const struct argp solve_materials_argp; // child of solve's; its input is
 int solve_read_lights(struct joint_result *out, struct lights *lights, const struct solve_materials *set, const struct inputs *in,
                       const struct samples *samples, const uint8_t *held_out, enum method method, int n_threads);
 
-// Stage 2 from what stage 1 found; with n_relocations > 0 and n_groups of lights, the lights of stage1 once more under the materials, so often as that pays.
-int solve_find_materials(struct materials *out, const struct solve_materials *set, struct joint_result *stage1, 
+// Stage 2 from what stage 1 found; with n_relocations > 0 and n_groups of lights, the lights of stage1 once more under the materials, so often as that pays,
+// and what is to be doubted about them. Where something is glossy, `lights` and those of stage1 become finer, each in its group.
+int solve_find_materials(struct materials *out, const struct solve_materials *set, struct joint_result *stage1, struct lights *lights,
                          const struct joint_settings *joint, const struct inputs *in, const struct samples *samples, const uint8_t *held_out,
                          int n_threads);
 // albedo.exr, brdf.exr, std.exr (ten parameters, then albedo_R, albedo_G, albedo_B; infinite: nothing depends on it) and validity.exr (Y: 1 measured, .5 weak, 0
