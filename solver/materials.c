@@ -730,17 +730,21 @@ static int judge(struct estimate *e, const struct materials_input *in, struct ma
     return err ? err : fill_unobserved(e, m);
 }
 
-// Of each region; without regions, of texels here and there.
+// Of texels here and there: those that are well known or, where none is, any that was observed.
 static void check_energy(const struct estimate *e, struct materials *m)
 {
     enum { LOOKS = 96 };
+    int n_known = 0;
+    for (int t = 0; t < m->n_texels; t++)
+        n_known += m->validity[t] == MATERIAL_VALID;
+    const uint8_t least = n_known ? MATERIAL_VALID : MATERIAL_WEAK;
     for (int k = 0; k < LOOKS && k < m->n_texels; k++) {
         const int t = (int)((int64_t)k * m->n_texels / (m->n_texels < LOOKS ? m->n_texels : LOOKS));
-        if (m->validity[t] != MATERIAL_VALID)
+        if (m->validity[t] < least)
             continue;
         m->most_directional_albedo = fmax(m->most_directional_albedo, materials_directional_albedo(m->theta[t], m->albedo[t], e->set->variant));
     }
-    if (m->most_directional_albedo > 1.02)
+    if (materials_make_light(m))
         log_warning("materials: a texel sends back %.2f times the light that it gets: such a material makes light; is the panorama's scale that of the views?",
                     m->most_directional_albedo);
 }

@@ -82,5 +82,11 @@ struct materials {
 int materials_solve(struct materials *out, const struct materials_input *input, const struct materials_settings *settings);
 void materials_free(struct materials *m); // leaves it zeroed
 
+// Whether some material sends back more light than it gets, by more than this look at it is wrong by.
+static inline bool materials_make_light(const struct materials *m)
+{
+    return m->most_directional_albedo > 1.02;
+}
+
 // Directional albedo (share of the light from one direction that leaves again) of a material, its largest over views and channels.
 double materials_directional_albedo(const float theta[DISNEY_N], const float albedo[3], enum disney_variant variant);

@@ -96,6 +96,12 @@ gives 0 "solve finds textures under lights that are given" "$rigsolve" solve "$d
 json_has "$dir/textures/report.json" '($m = $d->{stages}{materials}) && $m->{rmse_fit_percent} < 1 && @{$m->{regions}} == 1 &&
     abs($m->{regions}[0]{theta}{roughness} - .6) < .05 && $m->{regions}[0]{model}{roughness} =~ /^(tied|free)$/ && @{$m->{levels}} >= 6'
 result $? "one region, its roughness, every level reported"
+json_has "$dir/textures/report.json" '($a = $d->{stages}{materials}{most_directional_albedo}) > .3 && $a < 1 && !@{$d->{warnings}}'
+result $? "materials that keep their light give no warning"
+perl -0777 -pe 's{("irradiance": *\[)([^]]*)}{$1 . join ",", map { $_ / 4 } split /,/, $2}ge' "$dir/one/truth/lights.json" >"$dir/dim.json"
+gives 0 "solve under a quarter of the light" "$rigsolve" solve "$dir/one" -o "$dir/bright" $under --lights-from "$dir/dim.json"
+json_has "$dir/bright/report.json" '$d->{stages}{materials}{most_directional_albedo} > 1 && grep { /makes light/ } @{$d->{warnings}}'
+result $? "materials that would have to make light are warned of"
 gives 0 "solve again with other threads" "$rigsolve" solve "$dir/one" -o "$dir/textures3" $under --threads 3
 for f in albedo brdf std validity; do cmp "$dir/textures/$f.exr" "$dir/textures3/$f.exr" || break; done >"$dir/log" 2>&1
 result $? "same textures, to the byte"

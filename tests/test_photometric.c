@@ -80,6 +80,10 @@ static void radiance(const struct photometric *p, const struct photometric_state
         for (int c = 0; c < 3; c++)
             L[c] += exp(s->log_gain[view]) * f[c] * nl * at.weight * s->lights.irradiance[i][c];
     }
+    // Light from all around: its colour times the albedo, and what a dielectric's surface sends back of it (F0 = .08 specular).
+    const double surface = p->model == REFLECT_DISNEY ? .08 * m.theta[DISNEY_SPECULAR] * (1 - m.theta[DISNEY_METALLIC]) : 0;
+    for (int c = 0; p->indirect && c < 3; c++)
+        L[c] += exp(s->log_gain[view]) * (double)p->indirect[texel][c] / M_PI * (albedo[c] + surface);
 }
 
 // L = constant + own * albedo at the tint of `tint`: a colour twice as bright has the same tint.
@@ -630,6 +634,26 @@ static void equations_hold_for_runs_of_lights(void **state)
     }
 }
 
+static void equations_hold_under_light_from_the_object_itself(void **state)
+{
+    (void)state;
+    for (int model = REFLECT_DISNEY; model <= REFLECT_LAMBERT; model++)
+        for (int albedo = ALBEDO_FREE; albedo <= ALBEDO_SHARED; albedo++) {
+            struct studio s;
+            studio_open(&s, (enum reflectance)model, (enum albedo_mode)albedo);
+            float(*indirect)[3] = malloc((size_t)s.texels.n * sizeof(*indirect));
+            assert_non_null(indirect);
+            for (int t = 0; t < s.texels.n; t++)
+                for (int c = 0; c < 3; c++)
+                    indirect[t][c] = (float)uniform(14, (uint64_t)(3 * t + c));
+            s.p.indirect = (const float(*)[3])indirect;
+            photograph(&s, 0);
+            equations_hold(&s);
+            free(indirect);
+            studio_close(&s);
+        }
+}
+
 // Groups of unequal sizes whose lights have distances of their own, in a fixed ratio to their group's.
 static void equations_hold_for_lights_in_ratio_to_their_group(void **state)
 {
@@ -990,6 +1014,7 @@ int main(void)
         cmocka_unit_test(measuring_leaves_the_albedo_alone),
         cmocka_unit_test(equations_are_those_of_the_residuals),
         cmocka_unit_test(equations_hold_for_runs_of_lights),
+        cmocka_unit_test(equations_hold_under_light_from_the_object_itself),
         cmocka_unit_test(equations_hold_for_lights_in_ratio_to_their_group),
         cmocka_unit_test(what_is_left_out_does_not_count),
         cmocka_unit_test(clipped_samples_are_lower_bounds),

@@ -343,6 +343,8 @@ static struct json *make_report(const struct scene *scene, const struct settings
     for (unsigned bit = 1; bit <= DOUBT_POOR_FIT; bit <<= 1)
         if (r->doubts & bit)
             json_append_string(warnings, joint_doubt_text(bit));
+    if (m->theta)
+        solve_warn_of_materials(warnings, m);
     json_set(o, "warnings", warnings);
     json_set_number(stage1, "wall_s", stage_s);
     json_set_int(stage1, "iterations", r->n_jacobians);

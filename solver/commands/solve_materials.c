@@ -387,6 +387,16 @@ static struct json *by_name(const float *values)
     return o;
 }
 
+void solve_warn_of_materials(struct json *warnings, const struct materials *m)
+{
+    char text[160];
+    if (!materials_make_light(m))
+        return;
+    snprintf(text, sizeof(text), "a material sends back %.2f times the light that it gets: it makes light; is the panorama's scale that of the views?",
+             m->most_directional_albedo);
+    json_append_string(warnings, text);
+}
+
 void solve_report_materials(struct json *report, struct json *stages, const struct materials *m, double wall_s)
 {
     struct json *stage = json_object(), *levels = json_array(), *regions = json_array();

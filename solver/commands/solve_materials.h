@@ -26,6 +26,8 @@ int solve_find_materials(struct materials *out, const struct solve_materials *se
 // albedo.exr, brdf.exr, std.exr (ten parameters, then albedo_R, albedo_G, albedo_B; infinite: nothing depends on it) and validity.exr (Y: 1 measured, .5 weak, 0
 // filled from neighbours; coverage: samples; region) into dir. 0 or -errno.
 int solve_write_materials(const struct materials *m, const struct texels *t, const char *dir);
+// What the report has to warn of. warnings: its array.
+void solve_warn_of_materials(struct json *warnings, const struct materials *m);
 // The report's "stages.materials", and its RMSE over stage 1's.
 void solve_report_materials(struct json *report, struct json *stages, const struct materials *m, double wall_s);
 void solve_print_materials(const struct materials *m);
