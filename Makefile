@@ -55,7 +55,7 @@ FUZZED := $(TAKE) $(addprefix solver/,cameras.c cameras_bundler.c cameras_colmap
 TESTS := $(addprefix test_,alternating brdf cameras cameras_import compare csv disney emitters export gltf_brdf image joint json judge levels \
   lights lm materials mesh misfit normal_equations orientation panorama parallel pcg photometric rays render report rigsim samples shapes stability \
   synth take texels vec3 visibility) check_kernels
-RIG_TESTS := $(addprefix test_,camera camera_worker config container control digest ingest manifest personality rig trigger)
+RIG_TESTS := $(addprefix test_,camera camera_worker config container control digest ingest ledger manifest personality rig trigger)
 FUZZERS := cameras cameras_import csv exr hdr json lights mesh
 
 # ---- rules --------------------------------------------------------------------------------------------------------------
