@@ -51,12 +51,12 @@ RIGSIM_LIB := $(addprefix tests/rigsim/,body.c dataset.c faults.c frame.c jpeg.c
 RIGSIM := $(RIGSIM_LIB) $(addprefix tests/rigsim/,main.c server.c server_faults.c server_shutter.c)
 FUZZED := $(TAKE) $(addprefix solver/,cameras.c cameras_bundler.c cameras_colmap.c cameras_format.c cameras_meshroom.c \
   cameras_metashape.c cameras_realitycapture.c csv.c lights.c mesh.c mesh_gltf_floats.c mesh_import.c orientation.c panorama.c parallel.c \
-  picture_size.c texels.c xml.c)
+  picture_size.c texels.c xml.c) $(addprefix rigd/,config.c control.c)
 TESTS := $(addprefix test_,alternating brdf cameras cameras_import compare csv disney emitters export gltf_brdf image joint json judge levels \
   lights lm materials mesh misfit normal_equations orientation panorama parallel pcg photometric rays render report rigsim samples shapes stability \
   synth take texels vec3 visibility) check_kernels
-RIG_TESTS := $(addprefix test_,camera camera_worker config container control digest ingest ledger manifest personality rig trigger)
-FUZZERS := cameras cameras_import csv exr hdr json lights mesh
+RIG_TESTS := $(addprefix test_,calibrate camera camera_worker config container control digest ingest ledger manifest personality rig trigger)
+FUZZERS := cameras cameras_import config control csv exr hdr json lights mesh
 
 # ---- rules --------------------------------------------------------------------------------------------------------------
 object = $(patsubst %.c,$(BUILD)/obj/%.o,$(1))
@@ -122,7 +122,7 @@ $(BUILD)/fuzz/obj/%.o: %.c Makefile | deps-fuzz
 	$(Q)clang $(FUZZ_FLAGS) -MMD -MP -c $< -o $@
 $(BUILD)/fuzz/fuzz_%: $(BUILD)/fuzz/obj/tests/fuzz/fuzz_%.o $(patsubst %.c,$(BUILD)/fuzz/obj/%.o,$(FUZZED))
 	@$(if $(V),,echo '  LD (fuzz) $@')
-	$(Q)clang $(FUZZ_FLAGS) -fsanitize=fuzzer $^ $(LIBS) -o $@
+	$(Q)clang $(FUZZ_FLAGS) -fsanitize=fuzzer $^ $(LIBS) -linih -o $@
 
 # dpkg-query knows what is there; apt-get is asked only for what is not.
 install_packages = @missing=$$(for p in $(1); do dpkg-query -W -f='$${Status}\n' $$p 2>/dev/null | grep -q 'ok installed' || echo $$p; done); \
