@@ -138,7 +138,7 @@ deps-bench: deps ; $(call install_packages,$(PACKAGES_BENCH))
 # ---- tests ----------------------------------------------------------------------------------------------------------------
 TEST_PROGRAMS := $(addprefix $(BUILD)/tests/,$(TESTS) $(RIG_TESTS))
 test: deps all $(TEST_PROGRAMS)
-	@CMOCKA_MESSAGE_OUTPUT=TAP BIN=$(BUILD)/bin prove --timer --merge --exec '' tests/check_includes.sh tests/check_gpiod.sh $(TEST_PROGRAMS) tests/test_commands.sh
+	@CMOCKA_MESSAGE_OUTPUT=TAP BIN=$(BUILD)/bin prove --timer --merge --exec '' tests/check_includes.sh tests/check_gpiod.sh $(TEST_PROGRAMS) tests/test_commands.sh tests/test_rig_chain.sh
 $(BUILD)/tests/vm/test_gpio_vm: $(BUILD)/obj/tests/vm/test_gpio_vm.o $(BUILD)/librig.a $(BUILD)/libtake.a
 	$(link_rig) -Wl,--as-needed -lcmocka $(LIBS_RIG) -o $@
 test-vm: deps $(BUILD)/tests/vm/test_gpio_vm
@@ -184,19 +184,30 @@ stability: deps deps-bench $(BUILD)/tests/bench/stability_kernels $(BUILD)/tests
 
 # ---- installation ---------------------------------------------------------------------------------------------------------
 MAN := $(addprefix $(BUILD)/man/rigsolve,.1 $(addprefix -,$(addsuffix .1,$(filter-out arguments inputs output solve_materials solved,$(notdir $(COMMANDS:.c=))))))
-man: $(MAN)
+RIG_MAN := $(addprefix $(BUILD)/man/,rigctl.1 rigd.8)
+man: $(MAN) $(RIG_MAN)
+$(BUILD)/man/rigctl.1: $(BUILD)/bin/rigctl
+	@mkdir -p $(@D)
+	$(Q)help2man -N -n 'asks and tells the daemon of a photogrammetry rig' -o $@ $<
+$(BUILD)/man/rigd.8: $(BUILD)/bin/rigd
+	@mkdir -p $(@D)
+	$(Q)help2man -N -s 8 -n 'fires the cameras of a photogrammetry studio and keeps every frame' -o $@ $<
 $(BUILD)/man/rigsolve.1: $(BUILD)/bin/rigsolve
 	@mkdir -p $(@D)
 	$(Q)help2man -N -n 'from photographs in a studio to relightable materials' -o $@ $<
 $(BUILD)/man/rigsolve-%.1: $(BUILD)/bin/rigsolve
 	@mkdir -p $(@D)
 	$(Q)help2man -N -n 'rigsolve $*' --version-string=$(VERSION) -o $@ "$< $*"
-install: $(BUILD)/bin/rigsolve $(MAN)
-	install -D -m 755 $(BUILD)/bin/rigsolve $(DESTDIR)$(PREFIX)/bin/rigsolve
+install: all $(MAN) $(RIG_MAN)
+	install -D -m 755 -t $(DESTDIR)$(PREFIX)/bin $(addprefix $(BUILD)/bin/,rigsolve $(RIG_PROGRAMS))
 	install -D -m 644 -t $(DESTDIR)$(PREFIX)/share/man/man1 $(MAN)
+	install -D -m 644 -t $(DESTDIR)$(PREFIX)/share/man/man1 $(BUILD)/man/rigctl.1
+	install -D -m 644 -t $(DESTDIR)$(PREFIX)/share/man/man8 $(BUILD)/man/rigd.8
+	install -D -m 644 -t $(DESTDIR)$(PREFIX)/share/studiorig/rigs $(wildcard config/rig-*.conf)
+	install -D -m 644 -t $(DESTDIR)$(PREFIX)/share/studiorig/rigs/cameras $(wildcard config/cameras/*.conf)
 	install -D -m 644 config/blender/import_studiorig.py $(DESTDIR)$(PREFIX)/share/studiorig/blender/import_studiorig.py
 	install -D -m 644 config/completion/rigsolve.bash $(DESTDIR)$(PREFIX)/share/bash-completion/completions/rigsolve
-	install -D -m 644 -t $(DESTDIR)$(PREFIX)/share/doc/studiorig README.md LICENSE solver/NOTATION.md
+	install -D -m 644 -t $(DESTDIR)$(PREFIX)/share/doc/studiorig README.md LICENSE solver/NOTATION.md rigd/CONTROL.md
 clean:
 	rm -rf build
 help:

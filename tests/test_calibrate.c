@@ -78,7 +78,7 @@ static void too_few_shots_are_no_measurement(void **state)
 static void delays_bring_all_shutters_to_the_slowest(void **state)
 {
     (void)state;
-    const struct lag lag[4] = { { .mean_ms = 97, .n = 30 }, { .mean_ms = 117.25, .n = 30 }, { 0 }, { .mean_ms = 60, .n = 30 } };
+    const struct lag lag[4] = { { .mean_ms = 97, .n = 30 }, { .mean_ms = 117.25, .n = 30 }, { .n = 0 }, { .mean_ms = 60, .n = 30 } };
     uint32_t delay_us[4];
     assert_int_equal(lag_delays(lag, 4, 990000, delay_us), 0);
     assert_int_equal(delay_us[0], 20250);
@@ -87,7 +87,7 @@ static void delays_bring_all_shutters_to_the_slowest(void **state)
     assert_int_equal(delay_us[3], 57250);
     assert_int_equal(lag_delays(lag, 4, 30000, delay_us), 1);
     assert_int_equal(delay_us[3], 30000);
-    const struct lag none[2] = { { 0 } };
+    const struct lag none[2] = { { .n = 0 }, { .n = 0 } };
     assert_int_equal(lag_delays(none, 2, 1000, delay_us), 0);
     assert_int_equal(delay_us[0] + delay_us[1], 0);
 }
