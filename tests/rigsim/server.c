@@ -363,7 +363,7 @@ int server_listen(struct camera *c)
                                        .sin_addr.s_addr = htonl(INADDR_LOOPBACK) };
         const int fd = socket(AF_INET, SOCK_STREAM | SOCK_NONBLOCK | SOCK_CLOEXEC, 0);
         if (fd < 0 || setsockopt(fd, SOL_SOCKET, SO_REUSEADDR, &on, sizeof(on)) ||
-            bind(fd, (const struct sockaddr *)&a, sizeof(a)) || listen(fd, 8)) {
+            bind(fd, (const struct sockaddr *)&a, sizeof(a)) || listen(fd, 64)) {
             const int err = -errno;
             log_error("rigsim: 127.0.0.1:%d for camera %s: %s; choose another --port", port, server_camera_name(c->index),
                       strerror(-err));
