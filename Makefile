@@ -11,7 +11,8 @@ BUILD := build$(if $(filter-out release,$(VARIANT)),/$(VARIANT))
 MACHINE := $(shell uname -m)
 
 # ---- packages (Debian 12; the same names in Debian 13) ----------------------------------------------------------------
-PACKAGES := gcc make pkg-config libopenexr-dev libembree-dev libassimp-dev libjansson-dev libtiff-dev libpng-dev libjpeg-dev libexpat1-dev liblapacke-dev libopenblas-dev libcmocka-dev perl help2man
+PACKAGES := gcc make pkg-config libopenexr-dev libembree-dev libassimp-dev libjansson-dev libtiff-dev libjpeg-dev libpng-dev libexpat1-dev liblapacke-dev libopenblas-dev libcmocka-dev perl help2man \
+  libgphoto2-dev libgpiod-dev libinih-dev libsystemd-dev libxxhash-dev
 PACKAGES_FUZZ := clang libclang-rt-dev
 PACKAGES_BENCH := libceres-dev g++ gnuplot-nox
 
@@ -40,6 +41,11 @@ SOLVER := $(addprefix solver/,alternating.c cameras.c cameras_bundler.c cameras_
 KERNELS := $(addprefix solver/kernels/,kernels.c kernels_ref.c kernels_portable.c kernels_avx2.c kernels_avx512.c)
 COMMANDS := $(addprefix solver/commands/,arguments.c brdf.c compare.c export.c inputs.c lights.c output.c render.c report.c solve.c solve_materials.c solved.c synth.c visibility.c)
 LIBRARY := $(TAKE) $(SOLVER) $(KERNELS)
+RIG := $(addprefix rigd/,calibrate.c camera.c config.c container.c control.c describe.c digest.c doctor.c edges.c ingest.c ledger.c manifest.c personality.c rig.c trigger.c \
+  trigger_gpio.c trigger_lines.c trigger_sim.c trigger_software.c)
+RIG_PROGRAMS := rigctl rigd rigd-camera
+LIBS_RIG = -ljansson -linih -lsystemd -lxxhash -lgpiod -lm
+LIBS_CAMERA = -lgphoto2 -lgphoto2_port -ljansson -lxxhash -lm
 RIGSIM_LIB := $(addprefix tests/rigsim/,body.c dataset.c faults.c frame.c jpeg.c personality.c personality_builtin.c ptp.c ptp_canon.c ptp_datasets.c \
   ptp_nikon.c ptpip.c raw_dng.c scene.c)
 RIGSIM := $(RIGSIM_LIB) $(addprefix tests/rigsim/,main.c server.c server_faults.c server_shutter.c)
@@ -49,18 +55,19 @@ FUZZED := $(TAKE) $(addprefix solver/,cameras.c cameras_bundler.c cameras_colmap
 TESTS := $(addprefix test_,alternating brdf cameras cameras_import compare csv disney emitters export gltf_brdf image joint json judge levels \
   lights lm materials mesh misfit normal_equations orientation panorama parallel pcg photometric rays render report rigsim rigsim_wire samples shapes stability \
   synth take texels vec3 visibility) check_kernels
-FUZZERS := cameras cameras_import csv exr hdr json lights mesh
+RIG_TESTS := $(addprefix test_,camera camera_worker config container control digest ingest manifest personality rig trigger)
+FUZZERS := cameras cameras_import csv exr hdr json lights mesh ptpip
 
 # ---- rules --------------------------------------------------------------------------------------------------------------
 object = $(patsubst %.c,$(BUILD)/obj/%.o,$(1))
-ifneq ($(filter test demo bench chart figure5 figures stability experiments,$(MAKECMDGOALS)),)
+ifneq ($(filter test test-vm demo bench chart figure5 figures stability experiments,$(MAKECMDGOALS)),)
 FIRST := deps # these install what is missing before the first file is compiled
 endif
-.PHONY: all deps deps-fuzz deps-bench test demo bench chart figure5 figures stability experiments fuzz check-includes man install clean help
+.PHONY: all deps deps-fuzz deps-bench test test-vm demo bench chart figure5 figures stability experiments fuzz check-includes man install clean help
 .DELETE_ON_ERROR:
 .SECONDARY:
 
-all: $(BUILD)/bin/rigsim $(BUILD)/bin/rigsolve
+all: $(BUILD)/bin/rigsim $(BUILD)/bin/rigsolve $(addprefix $(BUILD)/bin/,$(RIG_PROGRAMS))
 
 $(BUILD)/obj/%.o: %.c Makefile | $(FIRST)
 	@mkdir -p $(@D)
@@ -77,10 +84,25 @@ $(BUILD)/libstudiorig.a: $(call object,$(LIBRARY))
 	@rm -f $@
 	@$(if $(V),,echo '  AR $@')
 	$(Q)ar rcsD $@ $^
+$(BUILD)/libtake.a: $(call object,$(TAKE))
+	@rm -f $@
+	@$(if $(V),,echo '  AR $@')
+	$(Q)ar rcsD $@ $^
+$(BUILD)/librig.a: $(call object,$(RIG))
+	@rm -f $@
+	@$(if $(V),,echo '  AR $@')
+	$(Q)ar rcsD $@ $^
 $(BUILD)/bin/rigsolve: $(call object,$(COMMANDS) solver/main.c) $(BUILD)/libstudiorig.a
 	@mkdir -p $(@D)
 	@$(if $(V),,echo '  LD $@')
 	$(Q)$(CC) $(CFLAGS_ALL) $^ $(LIBS) -o $@
+link_rig = @mkdir -p $(@D); $(if $(V),,echo '  LD $@';) $(CC) $(CFLAGS_ALL) $^
+$(BUILD)/bin/rigd: $(call object,rigd/main.c rigd/daemon.c) $(BUILD)/librig.a $(BUILD)/libtake.a
+	$(link_rig) $(LIBS_RIG) -o $@
+$(BUILD)/bin/rigctl: $(call object,rigd/rigctl.c) $(BUILD)/librig.a $(BUILD)/libtake.a
+	$(link_rig) $(LIBS_RIG) -o $@
+$(BUILD)/bin/rigd-camera: $(call object,rigd/camera_gphoto.c rigd/camera_worker.c) $(BUILD)/librig.a $(BUILD)/libtake.a
+	$(link_rig) $(LIBS_CAMERA) -o $@
 $(BUILD)/bin/rigsim: $(call object,$(RIGSIM)) $(BUILD)/libstudiorig.a
 	@mkdir -p $(@D)
 	@$(if $(V),,echo '  LD $@')
@@ -89,6 +111,8 @@ $(BUILD)/tests/%: $(BUILD)/obj/tests/%.o $(BUILD)/libstudiorig.a
 	@mkdir -p $(@D)
 	@$(if $(V),,echo '  LD $@')
 	$(Q)$(CC) $(CFLAGS_ALL) $^ -lcmocka $(LIBS) -o $@
+$(addprefix $(BUILD)/tests/,$(RIG_TESTS)): $(BUILD)/tests/%: $(BUILD)/obj/tests/%.o $(BUILD)/librig.a $(BUILD)/libtake.a
+	$(link_rig) -lcmocka $(LIBS_RIG) -o $@
 $(BUILD)/tests/test_rigsim: $(call object,$(RIGSIM_LIB))
 $(BUILD)/tests/test_rigsim: LIBS := $(BUILD)/libstudiorig.a $(LIBS)
 $(BUILD)/tests/test_rigsim_wire: $(call object,$(addprefix tests/rigsim/,client.c dataset.c ptpip.c)) | $(BUILD)/bin/rigsim
@@ -98,6 +122,8 @@ $(BUILD)/fuzz/obj/%.o: %.c Makefile | deps-fuzz
 	@mkdir -p $(@D)
 	@$(if $(V),,echo '  CC (fuzz) $<')
 	$(Q)clang $(FUZZ_FLAGS) -MMD -MP -c $< -o $@
+$(BUILD)/fuzz/fuzz_ptpip: $(patsubst %.c,$(BUILD)/fuzz/obj/%.o,$(addprefix tests/rigsim/,body.c dataset.c personality.c personality_builtin.c ptp.c \
+  ptp_canon.c ptp_datasets.c ptp_nikon.c ptpip.c))
 $(BUILD)/fuzz/fuzz_%: $(BUILD)/fuzz/obj/tests/fuzz/fuzz_%.o $(patsubst %.c,$(BUILD)/fuzz/obj/%.o,$(FUZZED))
 	@$(if $(V),,echo '  LD (fuzz) $@')
 	$(Q)clang $(FUZZ_FLAGS) -fsanitize=fuzzer $^ $(LIBS) -o $@
@@ -114,9 +140,13 @@ deps-fuzz: ; $(call install_packages,$(PACKAGES_FUZZ))
 deps-bench: deps ; $(call install_packages,$(PACKAGES_BENCH))
 
 # ---- tests ----------------------------------------------------------------------------------------------------------------
-TEST_PROGRAMS := $(addprefix $(BUILD)/tests/,$(TESTS))
-test: deps $(BUILD)/bin/rigsolve $(TEST_PROGRAMS)
-	@CMOCKA_MESSAGE_OUTPUT=TAP BIN=$(BUILD)/bin prove --timer --merge --exec '' tests/check_includes.sh $(TEST_PROGRAMS) tests/test_commands.sh
+TEST_PROGRAMS := $(addprefix $(BUILD)/tests/,$(TESTS) $(RIG_TESTS))
+test: deps all $(TEST_PROGRAMS)
+	@CMOCKA_MESSAGE_OUTPUT=TAP BIN=$(BUILD)/bin prove --timer --merge --exec '' tests/check_includes.sh tests/check_gpiod.sh $(TEST_PROGRAMS) tests/test_commands.sh tests/test_rigsim.sh
+$(BUILD)/tests/vm/test_gpio_vm: $(BUILD)/obj/tests/vm/test_gpio_vm.o $(BUILD)/librig.a $(BUILD)/libtake.a
+	$(link_rig) -Wl,--as-needed -lcmocka $(LIBS_RIG) -o $@
+test-vm: deps $(BUILD)/tests/vm/test_gpio_vm
+	@prove --timer --verbose --exec '' tests/vm/run.sh :: $(BUILD)/vm $(BUILD)/tests/vm/test_gpio_vm
 check-includes:
 	@prove --exec '' tests/check_includes.sh
 
@@ -176,6 +206,7 @@ clean:
 help:
 	@echo 'make            build/bin/rigsolve                make test      everything that must hold (installs packages)'
 	@echo 'make demo       a synthetic studio, end to end    make fuzz      libFuzzer on every parser (FUZZ_SECONDS=60)'
+	@echo 'make test-vm    GPIO on a simulated chip, in a virtual machine'
 	@echo 'make bench      seconds and errors of kernels     make chart     speed against accuracy      make stability  where it fails'
 	@echo 'make install    DESTDIR= PREFIX=/usr/local        make deps      Debian packages             make clean'
 	@echo 'variants: VARIANT=debug|asan|tsan; V=1 shows commands'

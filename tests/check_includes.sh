@@ -40,6 +40,9 @@ only_in Embree 'embree' solver/rays.c
 only_in LibRaw 'libraw' rigd/develop.c
 only_in libgphoto2 'gphoto2' rigd/camera_gphoto.c
 only_in libgpiod 'gpiod' rigd/trigger_gpio.c
+only_in inih 'ini\.h' rigd/config.c
+only_in xxHash 'xxhash' rigd/digest.c
+only_in systemd 'systemd/' rigd/daemon.c
 only_in libusb 'libusb' rigd/trigger_usb.c
 report "no folder or file is called utils or common" "$(find solver rigd firmware tests config -iname '*utils*' -o -iname 'common*' 2>/dev/null)"
 echo "1..$n"

@@ -1,0 +1,72 @@
+// rigd/config.h - rigd.conf: which cameras, which wires, what is wanted of them.
+//
+// INI (config/*.conf are complete examples). Everything is checked when it is read: an error names the file, the line, what was
+// found, what was expected and what to do. Unknown sections and keys are errors; so is a serial, port, line or name used twice,
+// and a line that the INI reader would cut (200 characters; section names 49).
+#pragma once
+#include "rigd/camera.h"
+
+enum { CONFIG_CAMERAS_MAX = 256, CONFIG_NONE = -1 };
+
+struct config_camera {       // [camera "A01"]
+    char name[24];           // letters, digits, - and _: it names files
+    char serial[40];         // "" : any body (a warning of preflight)
+    char port[96];           // usb:1-4.3 | ptpip:HOST:PORT:EVENTPORT
+    char model[64];          // driver's name of the body; "" by detection
+    char personality[256];   // path of config/cameras/NAME.conf, beside rigd.conf or in personality_dir; "" none
+    char lens[64];           // as the body reports it, "": not checked
+    int full_line, half_line; // trigger channels of this body alone; CONFIG_NONE: it hangs on the common lines
+    int feedback_line;       // flash-sync input; CONFIG_NONE
+    int relay_line;          // output that cuts its supply when set; CONFIG_NONE
+    char power[48];          // "1-4:3": hub and port that can switch its USB power; ""
+    int controller;          // bodies with the same number share one USB controller (from the slot's bus; PTP/IP: 0)
+    int n_settings;          // [settings] with this camera's own "setting.NAME = VALUE" on top
+    struct camera_setting setting[CAMERA_SETTINGS_MAX];
+};
+
+enum trigger_kind { TRIGGER_SOFTWARE, TRIGGER_GPIO, TRIGGER_USB, TRIGGER_SIMULATED };
+
+struct trigger_config {      // [trigger]
+    enum trigger_kind kind;
+    char chip[64];           // gpio: "gpiochip0" or a chip's label
+    char address[108];       // simulated: Unix socket of rigsim's trigger input
+    int full_line, half_line; // common lines; CONFIG_NONE
+    bool active_low;
+    int button_line;         // CONFIG_NONE
+    bool button_active_low, feedback_active_low;
+    uint32_t button_debounce_ms;
+    uint32_t half_press_ms;  // half-press before full-press; 0: no half-press
+    uint32_t hold_ms;        // full-press
+    uint32_t max_hold_ms;    // no line stays pressed longer, whatever anyone asks; at most 10000
+};
+
+struct config {
+    // [rig]
+    char name[64];
+    char takes_dir[300], socket_path[108], state_dir[300]; // state_dir: lag.json
+    char personality_dir[256];
+    int objects_per_shot;
+    uint32_t raw_mb;             // largest raw, for the check of free space and free images
+    uint32_t free_space_mb;      // left over after a take
+    bool delete_after_verify;    // from the card, after hash, sync and read-back
+    bool thumbnails;
+    int fetch_limit;             // parallel downloads per controller
+    uint32_t heartbeat_s;
+    int battery_min_percent;
+    double clock_max_s;
+    uint32_t collect_timeout_ms; // from the shot until a body must have announced its objects
+    uint32_t fetch_timeout_ms;   // one object, however slow, while bytes keep coming
+    int may_miss;                // cameras a take may leave out because they are not fit
+    // [calibration]
+    int calibration_shots;
+    double lag_max_std_ms;
+    struct trigger_config trigger;
+    int n_cameras;
+    struct config_camera *camera; // in the file's order: the camera numbers of all of rigd
+};
+
+// 0; -ENOENT..., -EINVAL (every finding logged, at most 20). *out is zeroed on failure.
+int config_read(struct config *out, const char *path);
+// The same from memory; name for errors. Personality files are not looked for.
+int config_parse(struct config *out, const char *text, size_t n_bytes, const char *name);
+void config_free(struct config *config);

@@ -1,0 +1,650 @@
+// rigd/ledger.c - take.json, and the folder it speaks for.
+//
+// Order is everything here. A take's folder appears whole (built under a hidden name, synced, renamed without replacing); its ledger is
+// replaced whole; a copy's bytes are synced before the copy is named (ingest.c). So each thing on disk is either complete or
+// recognisable as a leftover, and reconciling is looking, not guessing.
+#include "rigd/ledger.h"
+#include "rigd/digest.h"
+#include "solver/take/atomic_file.h"
+#include "solver/take/json.h"
+#include "solver/take/log.h"
+
+#include <ctype.h>
+#include <dirent.h>
+#include <errno.h>
+#include <fcntl.h>
+#include <stdio.h>
+#include <stdlib.h>
+#include <string.h>
+#include <sys/stat.h>
+#include <unistd.h>
+
+#define FORMAT "studiorig take 1"
+
+static const char *const state_names[TAKE_N_STATES] = {
+    "idle", "preflight", "armed", "exposing", "collecting", "verified", "developed", "solved", "failed",
+};
+static const char *const object_states[OBJECT_N_STATES] = { "found", "copied", "deleted", "gone" };
+static const char *const debts[] = { "open", "paid", "missed" };
+
+const char *take_state_name(enum take_state s)
+{
+    return (unsigned)s < TAKE_N_STATES ? state_names[s] : "?";
+}
+
+// ---- plain data ---------------------------------------------------------------------------------------------------------------
+
+void ledger_init(struct ledger *l, const struct config *config)
+{
+    *l = (struct ledger){ .objects_per_shot = config->objects_per_shot, .spread_ns = -1, .sigma_ns = -1, .jitter_ns = -1 };
+    l->camera = calloc((size_t)config->n_cameras + 1, sizeof(*l->camera));
+    if (!l->camera)
+        return;
+    l->n_cameras = config->n_cameras;
+    for (int i = 0; i < l->n_cameras; i++) {
+        struct ledger_camera *c = &l->camera[i];
+        memcpy(c->name, config->camera[i].name, sizeof(c->name));
+        memcpy(c->port, config->camera[i].port, sizeof(c->port));
+        memcpy(c->serial, config->camera[i].serial, sizeof(c->serial));
+        c->battery_percent = -1;
+        c->expected = true;
+        c->lag_ns = INT64_MIN;
+    }
+}
+
+void ledger_free(struct ledger *l)
+{
+    free(l->camera);
+    *l = (struct ledger){ 0 };
+}
+
+struct ledger_object *ledger_find(struct ledger_camera *c, const struct camera_object *o)
+{
+    for (int i = 0; i < c->n_objects; i++)
+        if (!strcmp(c->object[i].object.folder, o->folder) && !strcmp(c->object[i].object.name, o->name))
+            return &c->object[i];
+    return NULL;
+}
+
+bool ledger_owns(const struct ledger_camera *c, const struct camera_object *o)
+{
+    for (int i = 0; i < c->n_before; i++)
+        if (camera_same_store(&c->before[i], o) && camera_object_order(o, &c->before[i]) <= 0)
+            return false;
+    if (!c->has_until)
+        return true;
+    for (int i = 0; i < c->n_until; i++)
+        if (camera_same_store(&c->until[i], o))
+            return camera_object_order(o, &c->until[i]) <= 0;
+    return false;
+}
+
+struct ledger_object *ledger_add(struct ledger_camera *c, const struct camera_object *o)
+{
+    char extension[12] = "", name[24];
+    memcpy(name, c->name, sizeof(name));
+    if (c->n_objects == LEDGER_OBJECTS_MAX)
+        return NULL;
+    const char *dot = strrchr(o->name, '.');
+    for (size_t i = 0; dot && dot[i] && i < sizeof(extension) - 1; i++) // card names are ASCII; anything else is not for our names
+        extension[i] = i == 0 || isalnum((unsigned char)dot[i]) ? (char)tolower((unsigned char)dot[i]) : '_';
+    struct ledger_object *added = &c->object[c->n_objects];
+    *added = (struct ledger_object){ .object = *o, .state = OBJECT_FOUND, .copied_ms = -1 };
+    for (int n = 1;; n++) {
+        bool taken = false;
+        if (n == 1)
+            snprintf(added->file, sizeof(added->file), "raw/%.23s%s", name, extension);
+        else
+            snprintf(added->file, sizeof(added->file), "raw/%.23s_%d%s", name, n, extension);
+        for (int i = 0; i < c->n_objects; i++)
+            taken |= !strcmp(c->object[i].file, added->file);
+        if (!taken)
+            break;
+    }
+    c->n_objects++;
+    return added;
+}
+
+bool ledger_is_whole(const struct ledger *l)
+{
+    for (int i = 0; i < l->n_cameras; i++) {
+        const struct ledger_camera *c = &l->camera[i];
+        int n_here = 0;
+        for (int k = 0; k < c->n_objects; k++) {
+            const enum object_state state = c->object[k].state;
+            if (c->expected && (state == OBJECT_FOUND || state == OBJECT_GONE))
+                return false;
+            n_here += state == OBJECT_COPIED || state == OBJECT_DELETED;
+        }
+        if (c->expected && (c->debt != DEBT_PAID || n_here < l->objects_per_shot))
+            return false;
+    }
+    return true;
+}
+
+// ---- to and from JSON --------------------------------------------------------------------------------------------------------------
+
+static void put(struct json *o, const char *key, const char *value)
+{
+    if (value[0])
+        json_set_string(o, key, value);
+}
+
+static struct json *object_json(const struct camera_object *o)
+{
+    struct json *v = json_new_object();
+    json_set_string(v, "folder", o->folder);
+    json_set_string(v, "name", o->name);
+    json_set_int(v, "size", o->size_bytes);
+    return v;
+}
+
+static struct json *camera_json(const struct ledger_camera *c)
+{
+    struct json *v = json_new_object(), *list;
+    json_set_string(v, "name", c->name);
+    put(v, "serial", c->serial);
+    put(v, "port", c->port);
+    put(v, "model", c->model);
+    put(v, "firmware", c->firmware);
+    put(v, "lens", c->lens);
+    if (c->battery_percent >= 0)
+        json_set_int(v, "battery_percent", c->battery_percent);
+    json_set_bool(v, "expected", c->expected);
+    json_set_string(v, "debt", debts[c->debt]);
+    put(v, "note", c->note);
+    json_set_int(v, "delay_us", c->delay_us);
+    if (c->lag_ns != INT64_MIN)
+        json_set_int(v, "lag_ns", c->lag_ns);
+    list = json_new_array();
+    for (int i = 0; i < c->n_before; i++)
+        json_append(list, object_json(&c->before[i]));
+    json_set(v, "before", list);
+    list = json_new_array();
+    for (int i = 0; i < c->n_objects; i++) {
+        const struct ledger_object *o = &c->object[i];
+        struct json *e = object_json(&o->object);
+        json_set_string(e, "state", object_states[o->state]);
+        json_set_string(e, "file", o->file);
+        put(e, "xxh128", o->xxh128);
+        json_set_int(e, "retries", o->n_retries);
+        if (o->copied_ms >= 0)
+            json_set_int(e, "copied_ms", o->copied_ms);
+        json_append(list, e);
+    }
+    json_set(v, "objects", list);
+    list = json_new_array();
+    for (int i = 0; i < c->n_settings; i++) {
+        struct json *s = json_new_object();
+        json_set_string(s, "name", c->setting[i].name);
+        json_set_string(s, "wanted", c->setting[i].wanted);
+        json_set_string(s, "found", c->setting[i].found);
+        json_append(list, s);
+    }
+    json_set(v, "settings", list);
+    return v;
+}
+
+char *ledger_text(const struct ledger *l)
+{
+    struct json *doc = json_new_object(), *list = json_new_array(), *shot = json_new_object();
+    json_set_string(doc, "format", FORMAT);
+    json_set_string(doc, "name", l->name);
+    json_set_string(doc, "created", l->created);
+    json_set_string(doc, "state", take_state_name(l->state));
+    json_set_string(doc, "id", l->id);
+    put(doc, "reason", l->reason);
+    json_set_string(doc, "rigd", STUDIORIG_VERSION);
+    json_set_int(doc, "objects_per_shot", l->objects_per_shot);
+    json_set_bool(shot, "synchronised", l->synchronised);
+    json_set_int(shot, "utc_ms", l->shot_utc_ms);
+    json_set_int(shot, "spread_ns", l->spread_ns);
+    json_set_int(shot, "sigma_ns", l->sigma_ns);
+    json_set_int(shot, "n_measured", l->n_measured);
+    json_set_int(shot, "jitter_ns", l->jitter_ns);
+    json_set(doc, "shot", shot);
+    for (int i = 0; i < l->n_cameras; i++)
+        json_append(list, camera_json(&l->camera[i]));
+    json_set(doc, "cameras", list);
+    char *text = json_text(doc);
+    json_free(doc);
+    return text;
+}
+
+struct reader {
+    const struct json *v;
+    const char *file; // for errors
+    char where[40];
+    bool bad;
+};
+
+static void complain(struct reader *r, const char *key, const char *expected)
+{
+    if (!r->bad)
+        log_error("ledger: %s: %s%s%s: expected %s; restore the file from a backup or fetch the take anew", r->file, r->where, r->where[0] ? "." : "", key, expected);
+    r->bad = true;
+}
+
+static void get_string(struct reader *r, const char *key, char *out, size_t room)
+{
+    const char *text = "";
+    const int err = json_get_string(r->v, key, &text);
+    out[0] = 0;
+    if (err == -ENOENT)
+        return;
+    if (err || strlen(text) >= room) {
+        complain(r, key, "a short text");
+        return;
+    }
+    memcpy(out, text, strlen(text) + 1);
+}
+
+static int64_t get_int(struct reader *r, const char *key, int64_t least, int64_t most, int64_t missing)
+{
+    int64_t n;
+    const int err = json_get_int(r->v, key, &n);
+    if (err == -ENOENT)
+        return missing;
+    if (err || n < least || n > most) {
+        complain(r, key, "a whole number within its range");
+        return missing;
+    }
+    return n;
+}
+
+static int get_word(struct reader *r, const char *key, const char *const *words, int n)
+{
+    const char *text;
+    if (!json_get_string(r->v, key, &text))
+        for (int i = 0; i < n; i++)
+            if (!strcmp(text, words[i]))
+                return i;
+    complain(r, key, "one of its words");
+    return 0;
+}
+
+static bool get_bool(struct reader *r, const char *key)
+{
+    bool b = false;
+    if (json_get_bool(r->v, key, &b))
+        complain(r, key, "true or false");
+    return b;
+}
+
+static int get_length(struct reader *r, const char *key, int most)
+{
+    const int n = json_length(r->v, key);
+    if (n < 0 || n > most) {
+        complain(r, key, "a list of bounded length");
+        return 0;
+    }
+    return n;
+}
+
+static struct reader child(const struct reader *parent, const char *list, int i)
+{
+    char key[40];
+    struct reader r = { .file = parent->file };
+    snprintf(key, sizeof(key), "%.20s.%d", list, i);
+    snprintf(r.where, sizeof(r.where), "%.20s%s%.18s", parent->where, parent->where[0] ? "." : "", key);
+    r.v = json_get(parent->v, key);
+    return r;
+}
+
+static bool is_plain(const char *s)
+{
+    return s[0] && strspn(s, "abcdefghijklmnopqrstuvwxyzABCDEFGHIJKLMNOPQRSTUVWXYZ0123456789-_") == strlen(s);
+}
+
+static void get_object(struct reader *r, struct camera_object *o)
+{
+    get_string(r, "folder", o->folder, sizeof(o->folder));
+    get_string(r, "name", o->name, sizeof(o->name));
+    o->size_bytes = get_int(r, "size", -1, INT64_MAX, -1);
+    if (o->folder[0] != '/' || !o->name[0] || strchr(o->name, '/') || o->name[0] == '.')
+        complain(r, "name", "a file on a card");
+}
+
+static void get_camera(struct reader *r, struct ledger_camera *c)
+{
+    get_string(r, "name", c->name, sizeof(c->name));
+    if (!is_plain(c->name))
+        complain(r, "name", "letters, digits, - and _");
+    get_string(r, "serial", c->serial, sizeof(c->serial));
+    get_string(r, "port", c->port, sizeof(c->port));
+    get_string(r, "model", c->model, sizeof(c->model));
+    get_string(r, "firmware", c->firmware, sizeof(c->firmware));
+    get_string(r, "lens", c->lens, sizeof(c->lens));
+    c->battery_percent = (int)get_int(r, "battery_percent", 0, 100, -1);
+    c->expected = get_bool(r, "expected");
+    c->debt = get_word(r, "debt", debts, 3);
+    get_string(r, "note", c->note, sizeof(c->note));
+    c->delay_us = get_int(r, "delay_us", 0, 1000000, 0);
+    c->lag_ns = get_int(r, "lag_ns", INT64_MIN, INT64_MAX, INT64_MIN);
+    c->n_before = get_length(r, "before", CAMERA_STORES_MAX);
+    for (int i = 0; i < c->n_before; i++) {
+        struct reader o = child(r, "before", i);
+        get_object(&o, &c->before[i]);
+        r->bad |= o.bad;
+    }
+    c->n_settings = get_length(r, "settings", CAMERA_SETTINGS_MAX);
+    for (int i = 0; i < c->n_settings; i++) {
+        struct camera_setting_found *f = &c->setting[i];
+        struct reader e = child(r, "settings", i);
+        get_string(&e, "name", f->name, sizeof(f->name));
+        get_string(&e, "wanted", f->wanted, sizeof(f->wanted));
+        get_string(&e, "found", f->found, sizeof(f->found));
+        f->equal = !strcmp(f->wanted, f->found);
+        r->bad |= e.bad;
+    }
+    c->n_objects = get_length(r, "objects", LEDGER_OBJECTS_MAX);
+    for (int i = 0; i < c->n_objects; i++) {
+        struct ledger_object *o = &c->object[i];
+        struct reader e = child(r, "objects", i);
+        get_object(&e, &o->object);
+        o->state = get_word(&e, "state", object_states, OBJECT_N_STATES);
+        get_string(&e, "file", o->file, sizeof(o->file));
+        get_string(&e, "xxh128", o->xxh128, sizeof(o->xxh128));
+        o->n_retries = (int)get_int(&e, "retries", 0, INT32_MAX, 0);
+        o->copied_ms = get_int(&e, "copied_ms", 0, INT64_MAX, -1);
+        if (strncmp(o->file, "raw/", 4) || !o->file[4] || o->file[4] == '.' || strchr(o->file + 4, '/'))
+            complain(&e, "file", "a file of raw/");
+        for (int k = 0; k < i; k++)
+            if (!strcmp(c->object[k].file, o->file))
+                complain(&e, "file", "a name of its own");
+        const bool has_copy = o->state == OBJECT_COPIED || o->state == OBJECT_DELETED;
+        if (o->xxh128[0] ? strlen(o->xxh128) != 32 || strspn(o->xxh128, "0123456789abcdef") != 32 : has_copy)
+            complain(&e, "xxh128", "32 hexadecimal digits");
+        r->bad |= e.bad;
+    }
+}
+
+int ledger_parse(struct ledger *out, const char *text, size_t n_bytes, const char *name)
+{
+    struct json *doc = NULL;
+    *out = (struct ledger){ 0 };
+    const int err = json_parse(&doc, text, n_bytes, name);
+    if (err)
+        return err;
+    struct reader r = { .v = doc, .file = name };
+    char format[32];
+    get_string(&r, "format", format, sizeof(format));
+    if (strcmp(format, FORMAT))
+        complain(&r, "format", "'" FORMAT "'");
+    get_string(&r, "id", out->id, sizeof(out->id));
+    if (!is_plain(out->id))
+        complain(&r, "id", "the folder's name");
+    get_string(&r, "name", out->name, sizeof(out->name));
+    get_string(&r, "created", out->created, sizeof(out->created));
+    out->state = get_word(&r, "state", state_names, TAKE_N_STATES);
+    get_string(&r, "reason", out->reason, sizeof(out->reason));
+    out->objects_per_shot = (int)get_int(&r, "objects_per_shot", 1, LEDGER_OBJECTS_MAX, 1);
+    struct reader shot = { .v = json_get(doc, "shot"), .file = name, .where = "shot" };
+    if (shot.v) {
+        out->synchronised = get_bool(&shot, "synchronised");
+        out->shot_utc_ms = get_int(&shot, "utc_ms", 0, INT64_MAX, 0);
+        out->spread_ns = get_int(&shot, "spread_ns", -1, INT64_MAX, -1);
+        out->sigma_ns = get_int(&shot, "sigma_ns", -1, INT64_MAX, -1);
+        out->n_measured = (int)get_int(&shot, "n_measured", 0, CONFIG_CAMERAS_MAX, 0);
+        out->jitter_ns = get_int(&shot, "jitter_ns", INT64_MIN, INT64_MAX, -1);
+    }
+    const int n = get_length(&r, "cameras", 4 * CONFIG_CAMERAS_MAX);
+    out->camera = calloc((size_t)n + 1, sizeof(*out->camera));
+    if (!out->camera) {
+        json_free(doc);
+        return -ENOMEM;
+    }
+    out->n_cameras = n;
+    for (int i = 0; i < n && !r.bad; i++) {
+        struct reader c = child(&r, "cameras", i);
+        get_camera(&c, &out->camera[i]);
+        r.bad |= c.bad;
+        for (int k = 0; k < i && !r.bad; k++)
+            if (!strcmp(out->camera[k].name, out->camera[i].name))
+                complain(&c, "name", "a name of its own"), r.bad = true;
+    }
+    json_free(doc);
+    if (r.bad || shot.bad) {
+        ledger_free(out);
+        return -EINVAL;
+    }
+    return 0;
+}
+
+// ---- on disk -------------------------------------------------------------------------------------------------------------------------
+
+static void join(char *out, size_t room, const char *dir, const char *name)
+{
+    snprintf(out, room, "%s/%s", dir, name);
+}
+
+int ledger_read(struct ledger *out, const char *take_dir)
+{
+    char path[1024], *text;
+    size_t n;
+    *out = (struct ledger){ 0 };
+    join(path, sizeof(path), take_dir, "take.json");
+    if (access(path, F_OK))
+        return -errno;
+    int err = file_read(&text, &n, path, 64 << 20);
+    if (err)
+        return err;
+    err = ledger_parse(out, text, n, path);
+    free(text);
+    return err;
+}
+
+int ledger_commit(const char *text, const char *take_dir)
+{
+    struct atomic_file f;
+    char path[1024];
+    join(path, sizeof(path), take_dir, "take.json");
+    int err = atomic_file_open(&f, path);
+    if (err)
+        return err;
+    fputs(text, f.stream); // commit looks at ferror
+    fputc('\n', f.stream);
+    return atomic_file_commit(&f);
+}
+
+static int sync_folder(const char *dir)
+{
+    const int fd = open(dir, O_RDONLY | O_DIRECTORY | O_CLOEXEC);
+    if (fd < 0)
+        return -errno;
+    const int err = fsync(fd) ? -errno : 0;
+    close(fd);
+    return err;
+}
+
+static const char *const folders[] = { "raw", "thumbnails", "linear", "geometry", "geometry/cameras" };
+enum { N_FOLDERS = sizeof(folders) / sizeof(folders[0]) };
+
+static void remove_new(const char *dir)
+{
+    char path[1024];
+    join(path, sizeof(path), dir, "take.json");
+    unlink(path);
+    for (int i = N_FOLDERS - 1; i >= 0; i--) {
+        join(path, sizeof(path), dir, folders[i]);
+        rmdir(path);
+    }
+    rmdir(dir);
+}
+
+int ledger_create(const char *text, const char *id, const char *takes_dir)
+{
+    char dir[1024], final[1024], path[1200];
+    join(final, sizeof(final), takes_dir, id);
+    snprintf(dir, sizeof(dir), "%s/.%s.part", takes_dir, id);
+    int err = make_directories(takes_dir);
+    if (err)
+        return err;
+    remove_new(dir); // of an earlier life that ended here
+    err = mkdir(dir, 0777) ? -errno : 0;
+    for (int i = 0; i < N_FOLDERS && !err; i++) {
+        join(path, sizeof(path), dir, folders[i]);
+        err = mkdir(path, 0777) ? -errno : 0;
+    }
+    if (!err) {
+        join(path, sizeof(path), dir, "geometry");
+        err = sync_folder(path);
+    }
+    if (!err)
+        err = ledger_commit(text, dir); // syncs dir as well
+    if (!err && renameat2(AT_FDCWD, dir, AT_FDCWD, final, RENAME_NOREPLACE))
+        err = -errno;
+    if (!err)
+        err = sync_folder(takes_dir);
+    if (err) {
+        log_error("ledger: cannot create %s: %s", final, strerror(-err));
+        remove_new(dir);
+    }
+    return err;
+}
+
+// ---- after a crash -------------------------------------------------------------------------------------------------------------------
+
+static bool is_part(const char *name)
+{
+    const size_t n = strlen(name);
+    return name[0] == '.' && n > 6 && !strcmp(name + n - 5, ".part");
+}
+
+static int remove_parts(const char *dir, int *n_removed)
+{
+    char path[1400];
+    DIR *d = opendir(dir);
+    if (!d)
+        return errno == ENOENT ? 0 : -errno;
+    int n = 0;
+    for (const struct dirent *e; (e = readdir(d));)
+        if (is_part(e->d_name)) {
+            join(path, sizeof(path), dir, e->d_name);
+            n += unlink(path) == 0;
+        }
+    closedir(d);
+    *n_removed += n;
+    return n ? sync_folder(dir) : 0;
+}
+
+// Never deleted: somebody may want to know what happened to it.
+static int set_aside(const char *path)
+{
+    char aside[1400];
+    for (int n = 0; n < 1000; n++) {
+        snprintf(aside, sizeof(aside), n ? "%s.damaged%d" : "%s.damaged", path, n);
+        if (!renameat2(AT_FDCWD, path, AT_FDCWD, aside, RENAME_NOREPLACE)) {
+            log_warning("ledger: %s is not what was copied; it is now %s, and the frame is fetched again", path, aside);
+            return 0;
+        }
+        if (errno != EEXIST)
+            return -errno;
+    }
+    return -EEXIST;
+}
+
+static int reconcile_object(struct ledger_object *o, const char *take_dir, struct ledger_findings *found, bool *taken_back)
+{
+    char path[1200], hex[DIGEST_HEX];
+    int64_t size = 0;
+    join(path, sizeof(path), take_dir, o->file);
+    const bool noted = o->state == OBJECT_COPIED || o->state == OBJECT_DELETED;
+    int err = digest_file(path, 1, hex, &size);
+    if (err && err != -ENOENT)
+        return err; // unreadable is not missing: a person has to look
+    bool good = !err && (noted ? !strcmp(hex, o->xxh128) : o->object.size_bytes < 0 || o->object.size_bytes == size);
+    if (!err && !good) {
+        err = set_aside(path);
+        if (err)
+            return err;
+    }
+    if (good && !noted) {
+        o->state = OBJECT_COPIED;
+        o->object.size_bytes = size;
+        memcpy(o->xxh128, hex, sizeof(o->xxh128));
+        found->n_adopted++;
+    }
+    if (!good && noted) {
+        o->state = o->state == OBJECT_DELETED ? OBJECT_GONE : OBJECT_FOUND;
+        o->xxh128[0] = 0;
+        *taken_back = true;
+        found->n_taken_back++;
+        if (o->state == OBJECT_GONE)
+            log_error("ledger: %s is lost: its copy is missing or damaged, and the card's frame was deleted after it was verified", path);
+    }
+    return 0;
+}
+
+int ledger_reconcile(struct ledger *l, const char *take_dir, struct ledger_findings *found)
+{
+    char path[1100];
+    *found = (struct ledger_findings){ 0 };
+    int err = remove_parts(take_dir, &found->n_parts_removed);
+    for (int i = 0; i < N_FOLDERS && !err; i++) {
+        join(path, sizeof(path), take_dir, folders[i]);
+        err = remove_parts(path, &found->n_parts_removed);
+    }
+    for (int i = 0; i < l->n_cameras && !err; i++) {
+        struct ledger_camera *c = &l->camera[i];
+        bool taken_back = false;
+        for (int k = 0; k < c->n_objects && !err; k++)
+            err = reconcile_object(&c->object[k], take_dir, found, &taken_back);
+        if (taken_back)
+            c->debt = DEBT_OPEN;
+    }
+    join(path, sizeof(path), take_dir, "raw");
+    DIR *d = err ? NULL : opendir(path);
+    for (const struct dirent *e; d && (e = readdir(d));) {
+        bool known = e->d_name[0] == '.' || strstr(e->d_name, ".damaged");
+        for (int i = 0; i < l->n_cameras && !known; i++)
+            for (int k = 0; k < l->camera[i].n_objects && !known; k++)
+                known = !strcmp(l->camera[i].object[k].file + 4, e->d_name);
+        if (!known) {
+            found->n_strangers++;
+            log_warning("ledger: %s/%s is in no ledger; it is left alone", path, e->d_name);
+        }
+    }
+    if (d)
+        closedir(d);
+    if (err)
+        log_error("ledger: cannot reconcile %s: %s", take_dir, strerror(-err));
+    return err;
+}
+
+static bool same_body(const struct ledger_camera *a, const struct ledger_camera *b)
+{
+    return a->serial[0] && b->serial[0] ? !strcmp(a->serial, b->serial) : !strcmp(a->name, b->name);
+}
+
+int ledger_bound(struct ledger *l, const char *takes_dir)
+{
+    struct dirent **entries = NULL;
+    char path[1024];
+    const int n = scandir(takes_dir, &entries, NULL, alphasort);
+    if (n < 0) {
+        const int err = -errno;
+        log_error("ledger: cannot list %s: %s", takes_dir, strerror(-err));
+        return err;
+    }
+    for (int i = 0; i < l->n_cameras; i++)
+        l->camera[i].has_until = false;
+    for (int e = 0; e < n; e++) {
+        struct ledger later;
+        const bool is_later = strcmp(entries[e]->d_name, l->id) > 0 && entries[e]->d_name[0] != '.';
+        join(path, sizeof(path), takes_dir, entries[e]->d_name);
+        free(entries[e]);
+        if (!is_later || ledger_read(&later, path))
+            continue;
+        for (int i = 0; i < l->n_cameras; i++)
+            for (int k = 0; !l->camera[i].has_until && k < later.n_cameras; k++)
+                if (later.camera[k].expected && same_body(&l->camera[i], &later.camera[k])) {
+                    l->camera[i].has_until = true;
+                    l->camera[i].n_until = later.camera[k].n_before;
+                    memcpy(l->camera[i].until, later.camera[k].before, sizeof(l->camera[i].until));
+                }
+        ledger_free(&later);
+    }
+    free(entries);
+    return 0;
+}

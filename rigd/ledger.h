@@ -1,0 +1,96 @@
+// rigd/ledger.h - take.json: what a take owes, and what is safely here.
+//
+// Plain data first; the state machine (rig.h) owns one and writes into it, the daemon makes it durable when told to. A ledger on
+// disk is always a whole one (temporary name, fsync, rename, fsync of the folder). Frames are named only when their bytes are
+// synced and read back, so the folder can be ahead of the ledger but never behind: ledger_reconcile() brings them together after
+// any crash, and the cards' listings (rig_request_resume) bring the rest.
+#pragma once
+#include "rigd/config.h"
+
+enum { LEDGER_FORMAT = 1, LEDGER_OBJECTS_MAX = 8 }; // per camera and take
+
+enum take_state { TAKE_IDLE, TAKE_PREFLIGHT, TAKE_ARMED, TAKE_EXPOSING, TAKE_COLLECTING, TAKE_VERIFIED, TAKE_DEVELOPED, TAKE_SOLVED, TAKE_FAILED, TAKE_N_STATES };
+
+enum object_state {
+    OBJECT_FOUND,    // on the card; where its copy goes is decided
+    OBJECT_COPIED,   // the copy is here: hashed, synced, read back, named
+    OBJECT_DELETED,  // and no longer on the card
+    OBJECT_GONE,     // neither here nor on the card any more: lost, and said so
+    OBJECT_N_STATES
+};
+
+struct ledger_object {
+    struct camera_object object;
+    enum object_state state;
+    char file[64];       // "raw/A01.nef", relative to the take
+    char xxh128[33];     // of the copy; "" before
+    int n_retries;
+    int64_t copied_ms;   // from the shot until the copy was safe; -1 not known
+};
+
+enum debt { DEBT_OPEN, DEBT_PAID, DEBT_MISSED }; // all expected objects copied | given up, see note
+
+struct ledger_camera {
+    char name[24], serial[40], port[96], model[64], firmware[40], lens[64];
+    int battery_percent;
+    bool expected;              // it takes part; false: left out (quarantined before the shot), see note
+    enum debt debt;
+    char note[200];             // why it was left out, missed or quarantined, and what to do
+    int n_before;               // newest object of each store before the shot: everything later is the take's
+    struct camera_object before[CAMERA_STORES_MAX];
+    bool has_until;             // a later take exists: what is later than until[], or on a store without one, belongs to it
+    int n_until;
+    struct camera_object until[CAMERA_STORES_MAX]; // not on disk: ledger_bound() finds it
+    int64_t delay_us;           // lag compensation applied
+    int64_t lag_ns;             // flash-sync after the press; INT64_MIN: not measured
+    int n_settings;
+    struct camera_setting_found setting[CAMERA_SETTINGS_MAX]; // read back
+    int n_objects;
+    struct ledger_object object[LEDGER_OBJECTS_MAX];
+};
+
+struct ledger {
+    char id[96];                // folder name: <UTC date>T<time>_<name>
+    char name[64];
+    char created[32];           // UTC, ISO 8601
+    enum take_state state;
+    char reason[200];           // of failed
+    int objects_per_shot;
+    bool synchronised;          // pressed by lines, not by drivers
+    int64_t shot_utc_ms;        // when the shutters were pressed; 0: not yet
+    int64_t spread_ns, sigma_ns; // over measured bodies; -1: not measured
+    int n_measured;
+    int64_t jitter_ns;          // how late the press was; -1
+    int n_cameras;
+    struct ledger_camera *camera; // in the order of the configuration
+};
+
+// Every configured camera expected, with an open debt. Out of memory: camera is NULL.
+void ledger_init(struct ledger *l, const struct config *config);
+void ledger_free(struct ledger *l);
+bool ledger_owns(const struct ledger_camera *c, const struct camera_object *o); // later than before[], not later than until[]?
+struct ledger_object *ledger_find(struct ledger_camera *c, const struct camera_object *o); // same folder and name; NULL
+// A new object of a camera with the name of its copy: raw/<camera>.<ext>, the second of one extension raw/<camera>_2.<ext>.
+// NULL when there are LEDGER_OBJECTS_MAX already.
+struct ledger_object *ledger_add(struct ledger_camera *c, const struct camera_object *o);
+
+char *ledger_text(const struct ledger *l);                      // JSON, malloc'd; NULL without memory
+int ledger_commit(const char *text, const char *take_dir);      // take.json, durable when it returns 0; else -errno (logged), the old one stands
+int ledger_read(struct ledger *out, const char *take_dir);      // 0, -ENOENT, -EINVAL (logged); *out zeroed on failure
+int ledger_parse(struct ledger *out, const char *text, size_t n_bytes, const char *name);
+
+// Create takes_dir/id with raw/, thumbnails/, linear/ and geometry/cameras/ and its first ledger, whole and durable or not at all.
+// -EEXIST if there is one. 0 or -errno (logged).
+int ledger_create(const char *text, const char *id, const char *takes_dir);
+
+// Bring ledger and disk together after a crash: remove *.part, hash frames that are here but not yet noted (they become COPIED),
+// take back COPIED notes whose file is missing, short or different (the copy is set aside as <name>.damaged, never deleted).
+struct ledger_findings { int n_adopted, n_taken_back, n_parts_removed, n_strangers; };
+int ledger_reconcile(struct ledger *l, const char *take_dir, struct ledger_findings *found); // 0 or -errno (logged)
+
+// Which frames belong to this take and not to later ones: look at the ledgers in takes_dir that come after it. 0 or -errno (logged).
+int ledger_bound(struct ledger *l, const char *takes_dir);
+
+// Every object of every expected camera copied (or deleted after copying) and no debt left?
+bool ledger_is_whole(const struct ledger *l);
+const char *take_state_name(enum take_state s); // "idle" ...

@@ -1,0 +1,159 @@
+// tests/test_config.c - a configuration is right, or its faults are named with file, line and remedy.
+#include "rigd/config.h"
+#include "solver/take/atomic_file.h"
+#include "solver/take/log.h"
+
+#include <errno.h>
+#include <setjmp.h>
+#include <stdarg.h>
+#include <stddef.h>
+#include <stdio.h>
+#include <stdlib.h>
+#include <string.h>
+#include <cmocka.h>
+
+#define HEAD "[rig]\ntakes = /t\n[trigger]\nkind = software\n"     // lines 1-4
+#define A01 "[camera \"A01\"]\nport = usb:1-1\n"                    // two lines
+
+static char said[8000];
+
+static void listen(void *arg, enum log_level level, const char *message)
+{
+    (void)arg, (void)level;
+    strncat(said, message, sizeof(said) - strlen(said) - 2);
+    strcat(said, "\n");
+}
+
+static int parse(struct config *c, const char *text)
+{
+    said[0] = 0;
+    log_set_level(LOG_SILENT);
+    log_set_hook(listen, NULL);
+    const int err = config_parse(c, text, strlen(text), "rigd.conf");
+    log_set_hook(NULL, NULL);
+    log_set_level(LOG_INFO);
+    return err;
+}
+
+static void a_whole_configuration_is_read(void **state)
+{
+    (void)state;
+    struct config c;
+    char *text;
+    size_t n;
+    assert_int_equal(file_read(&text, &n, "tests/fuzz/seeds/config/small.conf", 1 << 20), 0);
+    assert_int_equal(parse(&c, text), 0);
+    free(text);
+    assert_int_equal(c.n_cameras, 2);
+    assert_string_equal(c.camera[0].name, "A01");
+    assert_string_equal(c.camera[0].serial, "6001234");
+    assert_int_equal(c.camera[0].controller, 2);
+    assert_int_equal(c.camera[1].controller, 0);
+    assert_int_equal(c.camera[0].relay_line, 23);
+    assert_int_equal(c.camera[1].relay_line, CONFIG_NONE);
+    assert_int_equal(c.camera[0].n_settings, 2);
+    assert_string_equal(c.camera[0].setting[0].value, "200"); // its own on top of all cameras'
+    assert_string_equal(c.camera[1].setting[0].value, "100");
+    assert_int_equal(c.trigger.kind, TRIGGER_GPIO);
+    assert_int_equal(c.trigger.full_line, 17);
+    assert_int_equal(c.trigger.button_line, CONFIG_NONE);
+    assert_true(c.clock_max_s == 2.5);
+    config_free(&c);
+}
+
+static void each_fault_is_named_with_its_line_and_a_remedy(void **state)
+{
+    (void)state;
+    static char long_line[300] = HEAD A01 "lens = ", long_section[200] = HEAD "[camera \"";
+    memset(long_line + strlen(long_line), 'x', 200);
+    strcat(long_line, "\n");
+    memset(long_section + strlen(long_section), 'x', 50);
+    strcat(long_section, "\"]\n");
+    static const struct {
+        const char *text, *where, *what;
+    } cases[] = {
+        { HEAD A01 "colour = red\n", "rigd.conf:7:", "knows no 'colour'" },
+        { HEAD A01 "[camera \"A02\"]\nport = usb:1-1\n", "rigd.conf:7:", "port usb:1-1 is camera \"A01\"'s already (line 5)" },
+        { HEAD A01 "serial = 7\n[camera \"A02\"]\nport = usb:1-2\nserial = 7\n", "rigd.conf:8:", "serial 7" },
+        { HEAD A01 "[camera \"a01\"]\nport = usb:1-2\n", "rigd.conf:7:", "name of its own" },
+        { HEAD "[camera \"A01\"]\nserial = 7\n", "rigd.conf:5:", "has no 'port'" },
+        { HEAD "[camera \"A01\"]\n", "rigd.conf:5:", "has no 'port'" },
+        { HEAD "[camera \"../etc\"]\nport = usb:1-1\n", "rigd.conf:5:", "file names" },
+        { HEAD "[camera A01]\nport = usb:1-1\n", "rigd.conf:5:", "[camera \"NAME\"]" },
+        { HEAD A01 "port = usb:1-2\n", "rigd.conf:7:", "twice" },
+        { HEAD A01 "[rig]\ntakes = /u\n", "rigd.conf:7:", "twice" },
+        { HEAD A01 "[lamp]\non = 1\n", "rigd.conf:7:", "[lamp]" },
+        { HEAD, "rigd.conf: ", "no [camera" },
+        { "[trigger]\nkind = software\n" A01, "rigd.conf: ", "[rig] is missing" },
+        { "[rig]\ntakes = /t\n" A01, "rigd.conf: ", "[trigger] is missing" },
+        { "[rig]\nname = x\n[trigger]\nkind = software\n" A01, "rigd.conf:1:", "no 'takes'" },
+        { "[rig]\ntakes = t\n[trigger]\nkind = software\n" A01, "rigd.conf:2:", "begins with /" },
+        { "[rig]\ntakes = /t\n[trigger]\nkind = magic\n" A01, "rigd.conf:4:", "software, gpio" },
+        { "[rig]\ntakes = /t\nraw_mb = 60.5\n[trigger]\nkind = software\n" A01, "rigd.conf:3:", "whole number from 1 to 4096" },
+        { "[rig]\ntakes = /t\nraw_mb = 1e3\n[trigger]\nkind = software\n" A01, "rigd.conf:3:", "found '1e3'" },
+        { "[rig]\ntakes = /t\n[trigger]\nkind = gpio\nchip = c\n" A01, "rigd.conf:6:", "nothing would press it" },
+        { "[rig]\ntakes = /t\n[trigger]\nkind = gpio\nfull_line = 1\n" A01, "rigd.conf: ", "chip" },
+        { "[rig]\ntakes = /t\n[trigger]\nkind = simulated\n" A01, "rigd.conf: ", "address" },
+        { "[rig]\ntakes = /t\n[trigger]\nkind = gpio\nchip = c\nfull_line = 4\n" A01 "feedback_line = 4\n", "rigd.conf:7:", "line 4 is [trigger] full_line already" },
+        { "[rig]\ntakes = /t\n[trigger]\nkind = software\nhold_ms = 500\nmax_hold_ms = 100\n" A01, "rigd.conf: ", "longer than max_hold_ms" },
+        { HEAD "[camera \"A01\"]\nport = usb:1,17\n", "rigd.conf:6:", "usb:BUS-PORT" },
+        { HEAD "[camera \"A01\"]\nport = ptpip:localhost:1:2\n", "rigd.conf:6:", "IPV4" },
+        { HEAD "[camera \"A01\"]\nport = ptpip:127.0.0.1:15740\n", "rigd.conf:6:", "EVENTPORT" },
+        { HEAD "[camera \"A01\"]\nport = ptpip:127.0.0.1:15740:70000\n", "rigd.conf:6:", "EVENTPORT" },
+        { HEAD A01 "power = 1-4\n", "rigd.conf:7:", "HUB:PORT" },
+        { "takes = /t\n" HEAD A01, "rigd.conf:1:", "in no section" },
+        { HEAD A01 "what is this\n", "rigd.conf:7:", "neither" },
+        { HEAD A01 "  lens = x\n", "rigd.conf:7:", "first column" },
+        { HEAD A01 "[settings]\nISO = 100\n", "rigd.conf:8:", "neutral name" },
+        { HEAD A01 "[settings]\niso = 100\niso = 200\n", "rigd.conf:9:", "twice" },
+        { long_line, "rigd.conf:7:", "at most 196" },
+        { long_section, "rigd.conf:5:", "section name of" },
+    };
+    for (size_t i = 0; i < sizeof(cases) / sizeof(cases[0]); i++) {
+        struct config c;
+        const int err = parse(&c, cases[i].text);
+        const char *line = strstr(said, cases[i].where);
+        if (err != -EINVAL || !line || !strstr(line, cases[i].what))
+            fail_msg("case %zu: %d, said: %s", i, err, said);
+        assert_null(c.camera);
+    }
+}
+
+static void a_thousand_faults_do_not_fill_the_journal(void **state)
+{
+    (void)state;
+    struct config c;
+    char *text = calloc(1, 20000);
+    strcpy(text, HEAD A01);
+    for (int i = 0; i < 1000; i++)
+        strcat(text, "x = y\n");
+    assert_int_equal(parse(&c, text), -EINVAL);
+    int lines = 0;
+    for (const char *s = said; *s; s++)
+        lines += *s == '\n';
+    assert_true(lines <= 21);
+    free(text);
+}
+
+static void zero_bytes_and_other_line_ends_are_no_trouble(void **state)
+{
+    (void)state;
+    struct config c;
+    assert_int_equal(parse(&c, "[rig]\r\ntakes = /t\r\n[trigger]\r\nkind = software\r\n[camera \"A\"]\r\nport = usb:1-1"), 0);
+    config_free(&c);
+    static const char zero[] = HEAD A01 "lens\0= x\n";
+    log_set_level(LOG_SILENT);
+    assert_int_equal(config_parse(&c, zero, sizeof(zero) - 1, "rigd.conf"), -EINVAL);
+    log_set_level(LOG_INFO);
+}
+
+int main(void)
+{
+    const struct CMUnitTest tests[] = {
+        cmocka_unit_test(a_whole_configuration_is_read),
+        cmocka_unit_test(each_fault_is_named_with_its_line_and_a_remedy),
+        cmocka_unit_test(a_thousand_faults_do_not_fill_the_journal),
+        cmocka_unit_test(zero_bytes_and_other_line_ends_are_no_trouble),
+    };
+    return cmocka_run_group_tests(tests, NULL, NULL);
+}
