@@ -2,7 +2,7 @@
 //
 // Starts build/bin/rigsim ($BIN/rigsim) on free ports.
 #include "tests/rigsim/client.h"
-#include "tests/rigsim/shutter_line.h"
+#include "rigd/shutter_line.h"
 #include "tests/scratch.h"
 
 #include <arpa/inet.h>
