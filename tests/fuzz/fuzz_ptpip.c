@@ -49,6 +49,8 @@ int LLVMFuzzerTestOneInput(const uint8_t *data, size_t size)
         return 0;
     body.measure = measure;
     ptp_session_init(&session, &body);
+    session.width_px = 64;
+    session.height_px = 48;
     int64_t now = 1;
     for (size_t at = 1; at < size;) {
         struct ptpip_packet p;
