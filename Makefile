@@ -53,7 +53,7 @@ FUZZED := $(TAKE) $(addprefix solver/,cameras.c cameras_bundler.c cameras_colmap
 TESTS := $(addprefix test_,alternating brdf cameras cameras_import compare csv disney emitters export gltf_brdf image joint json judge levels lights lm materials mesh misfit normal_equations orientation panorama parallel pcg photometric rays render report rigsim rigsim_wire samples shapes stability interreflection synth take texels vec3 visibility) check_kernels
   synth take texels vec3 visibility) check_kernels
 RIG_TESTS := $(addprefix test_,calibrate camera camera_worker config container control digest ingest ledger manifest personality rig studios trigger)
-FUZZERS := cameras cameras_import csv exr hdr json lights mesh config control
+FUZZERS := cameras cameras_import csv exr hdr json lights mesh config control ptpip
   picture_size.c texels.c xml.c) $(addprefix rigd/,config.c control.c)
 
 # ---- rules --------------------------------------------------------------------------------------------------------------
@@ -120,6 +120,8 @@ $(BUILD)/fuzz/obj/%.o: %.c Makefile | deps-fuzz
 	@mkdir -p $(@D)
 	@$(if $(V),,echo '  CC (fuzz) $<')
 	$(Q)clang $(FUZZ_FLAGS) -MMD -MP -c $< -o $@
+$(BUILD)/fuzz/fuzz_ptpip: $(patsubst %.c,$(BUILD)/fuzz/obj/%.o,$(addprefix tests/rigsim/,body.c dataset.c personality.c personality_builtin.c ptp.c \
+  ptp_canon.c ptp_datasets.c ptp_nikon.c ptpip.c))
 $(BUILD)/fuzz/fuzz_%: $(BUILD)/fuzz/obj/tests/fuzz/fuzz_%.o $(patsubst %.c,$(BUILD)/fuzz/obj/%.o,$(FUZZED))
 	@$(if $(V),,echo '  LD (fuzz) $@')
 	$(Q)clang $(FUZZ_FLAGS) -fsanitize=fuzzer $^ $(LIBS) -linih -o $@
@@ -139,6 +141,7 @@ deps-bench: deps ; $(call install_packages,$(PACKAGES_BENCH))
 TEST_PROGRAMS := $(addprefix $(BUILD)/tests/,$(TESTS) $(RIG_TESTS))
 test: deps all $(TEST_PROGRAMS)
 	@CMOCKA_MESSAGE_OUTPUT=TAP BIN=$(BUILD)/bin prove --timer --merge --exec '' tests/check_includes.sh tests/check_gpiod.sh $(TEST_PROGRAMS) tests/test_commands.sh tests/test_rig_chain.sh
+	@CMOCKA_MESSAGE_OUTPUT=TAP BIN=$(BUILD)/bin prove --timer --merge --exec '' tests/check_includes.sh tests/check_gpiod.sh $(TEST_PROGRAMS) tests/test_commands.sh tests/test_rigsim.sh
 $(BUILD)/tests/vm/test_gpio_vm: $(BUILD)/obj/tests/vm/test_gpio_vm.o $(BUILD)/librig.a $(BUILD)/libtake.a
 	$(link_rig) -Wl,--as-needed -lcmocka $(LIBS_RIG) -o $@
 test-vm: deps $(BUILD)/tests/vm/test_gpio_vm

@@ -119,16 +119,18 @@ static error_t option(int key, char *text, struct argp_state *state)
     }
 }
 
+// Sections of rigd.conf; personality: a file of config/cameras/.
 static void print_list(const struct server_settings *s)
 {
+    static const char *const rigd_personality[] = { [VENDOR_GENERIC] = "generic", [VENDOR_NIKON] = "nikon", [VENDOR_CANON] = "canon-eos" };
     if (s->trigger_socket)
         printf("[trigger]\nkind = simulated\naddress = %s\n\n", s->trigger_socket);
     for (unsigned i = 0; i < s->n_cameras; i++) {
         struct body b;
         if (body_init(&b, s->personality, i, s->seed, 0, 0))
             return;
-        printf("[camera \"%s\"]\nserial = %s\nport = ptpip:127.0.0.1:%u:%u\n", server_camera_name(i), b.serial,
-               (unsigned)s->port + 2 * i, (unsigned)s->port + 2 * i + 1);
+        printf("[camera \"%s\"]\nserial = %s\nport = ptpip:127.0.0.1:%u:%u\npersonality = %s\n", server_camera_name(i), b.serial,
+               (unsigned)s->port + 2 * i, (unsigned)s->port + 2 * i + 1, rigd_personality[s->personality->vendor]);
         if (s->trigger_socket)
             printf("full_line = %u\nhalf_line = %u\nfeedback_line = %u\nrelay_line = %u\n", i, i, i, i);
         printf("\n");
