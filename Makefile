@@ -41,8 +41,9 @@ SOLVER := $(addprefix solver/,alternating.c cameras.c cameras_bundler.c cameras_
 KERNELS := $(addprefix solver/kernels/,kernels.c kernels_ref.c kernels_portable.c kernels_avx2.c kernels_avx512.c)
 COMMANDS := $(addprefix solver/commands/,arguments.c brdf.c compare.c export.c inputs.c lights.c output.c render.c report.c solve.c solve_materials.c solved.c synth.c visibility.c)
 LIBRARY := $(TAKE) $(SOLVER) $(KERNELS)
-RIG := $(addprefix rigd/,calibrate.c camera.c config.c container.c digest.c ingest.c ledger.c personality.c rig.c)
-RIG_PROGRAMS := rigd-camera # of rigd rigctl rigd-camera: those whose sources are here
+RIG := $(addprefix rigd/,calibrate.c camera.c config.c container.c control.c describe.c digest.c doctor.c edges.c ingest.c ledger.c manifest.c personality.c rig.c trigger.c \
+  trigger_gpio.c trigger_lines.c trigger_sim.c trigger_software.c)
+RIG_PROGRAMS := rigctl rigd rigd-camera
 LIBS_RIG = -ljansson -linih -lsystemd -lxxhash -lgpiod -lm
 LIBS_CAMERA = -lgphoto2 -lgphoto2_port -ljansson -lxxhash -lm
 RIGSIM_LIB := $(addprefix tests/rigsim/,body.c dataset.c faults.c frame.c jpeg.c personality.c personality_builtin.c ptp.c ptp_canon.c ptp_datasets.c \
@@ -50,19 +51,19 @@ RIGSIM_LIB := $(addprefix tests/rigsim/,body.c dataset.c faults.c frame.c jpeg.c
 RIGSIM := $(RIGSIM_LIB) $(addprefix tests/rigsim/,main.c server.c server_faults.c server_shutter.c)
 FUZZED := $(TAKE) $(addprefix solver/,cameras.c cameras_bundler.c cameras_colmap.c cameras_format.c cameras_meshroom.c \
   cameras_metashape.c cameras_realitycapture.c csv.c lights.c mesh.c mesh_gltf_floats.c mesh_import.c orientation.c panorama.c parallel.c \
-  picture_size.c texels.c xml.c) $(addprefix rigd/,camera.c container.c personality.c)
+  picture_size.c texels.c xml.c) $(addprefix rigd/,camera.c config.c container.c control.c personality.c)
 TESTS := $(addprefix test_,alternating brdf cameras cameras_import compare csv disney emitters export gltf_brdf image joint json judge levels \
   lights lm materials mesh misfit normal_equations orientation panorama parallel pcg photometric rays render report rigsim samples shapes stability \
   synth take texels vec3 visibility) check_kernels
-RIG_TESTS := $(addprefix test_,camera camera_worker config container digest ingest personality rig)
-FUZZERS := camera cameras cameras_import container csv exr hdr json lights mesh personality
+RIG_TESTS := $(addprefix test_,calibrate camera camera_worker config container control digest ingest ledger manifest personality rig trigger)
+FUZZERS := camera cameras cameras_import config container control csv exr hdr json lights mesh personality
 
 # ---- rules --------------------------------------------------------------------------------------------------------------
 object = $(patsubst %.c,$(BUILD)/obj/%.o,$(1))
-ifneq ($(filter test demo bench chart figure5 figures stability experiments,$(MAKECMDGOALS)),)
+ifneq ($(filter test test-vm demo bench chart figure5 figures stability experiments,$(MAKECMDGOALS)),)
 FIRST := deps # these install what is missing before the first file is compiled
 endif
-.PHONY: all deps deps-fuzz deps-bench test demo bench chart figure5 figures stability experiments fuzz check-includes man install clean help
+.PHONY: all deps deps-fuzz deps-bench test test-vm demo bench chart figure5 figures stability experiments fuzz check-includes man install clean help
 .DELETE_ON_ERROR:
 .SECONDARY:
 
@@ -122,7 +123,7 @@ $(BUILD)/fuzz/obj/%.o: %.c Makefile | deps-fuzz
 	$(Q)clang $(FUZZ_FLAGS) -MMD -MP -c $< -o $@
 $(BUILD)/fuzz/fuzz_%: $(BUILD)/fuzz/obj/tests/fuzz/fuzz_%.o $(patsubst %.c,$(BUILD)/fuzz/obj/%.o,$(FUZZED))
 	@$(if $(V),,echo '  LD (fuzz) $@')
-	$(Q)clang $(FUZZ_FLAGS) -fsanitize=fuzzer $^ $(LIBS) -o $@
+	$(Q)clang $(FUZZ_FLAGS) -fsanitize=fuzzer $^ $(LIBS) -linih -o $@
 
 # dpkg-query knows what is there; apt-get is asked only for what is not.
 install_packages = @missing=$$(for p in $(1); do dpkg-query -W -f='$${Status}\n' $$p 2>/dev/null | grep -q 'ok installed' || echo $$p; done); \
@@ -138,7 +139,11 @@ deps-bench: deps ; $(call install_packages,$(PACKAGES_BENCH))
 # ---- tests ----------------------------------------------------------------------------------------------------------------
 TEST_PROGRAMS := $(addprefix $(BUILD)/tests/,$(TESTS) $(RIG_TESTS))
 test: deps all $(TEST_PROGRAMS)
-	@CMOCKA_MESSAGE_OUTPUT=TAP BIN=$(BUILD)/bin prove --timer --merge --exec '' tests/check_includes.sh $(TEST_PROGRAMS) tests/test_commands.sh
+	@CMOCKA_MESSAGE_OUTPUT=TAP BIN=$(BUILD)/bin prove --timer --merge --exec '' tests/check_includes.sh tests/check_gpiod.sh $(TEST_PROGRAMS) tests/test_commands.sh
+$(BUILD)/tests/vm/test_gpio_vm: $(BUILD)/obj/tests/vm/test_gpio_vm.o $(BUILD)/librig.a $(BUILD)/libtake.a
+	$(link_rig) -Wl,--as-needed -lcmocka $(LIBS_RIG) -o $@
+test-vm: deps $(BUILD)/tests/vm/test_gpio_vm
+	@prove --timer --verbose --exec '' tests/vm/run.sh :: $(BUILD)/vm $(BUILD)/tests/vm/test_gpio_vm
 check-includes:
 	@prove --exec '' tests/check_includes.sh
 
@@ -198,6 +203,7 @@ clean:
 help:
 	@echo 'make            build/bin/rigsolve                make test      everything that must hold (installs packages)'
 	@echo 'make demo       a synthetic studio, end to end    make fuzz      libFuzzer on every parser (FUZZ_SECONDS=60)'
+	@echo 'make test-vm    GPIO on a simulated chip, in a virtual machine'
 	@echo 'make bench      seconds and errors of kernels     make chart     speed against accuracy      make stability  where it fails'
 	@echo 'make install    DESTDIR= PREFIX=/usr/local        make deps      Debian packages             make clean'
 	@echo 'variants: VARIANT=debug|asan|tsan; V=1 shows commands'

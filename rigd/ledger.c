@@ -460,59 +460,10 @@ static int sync_folder(const char *dir)
 static const char *const folders[] = { "raw", "thumbnails", "linear", "geometry", "geometry/cameras" };
 enum { N_FOLDERS = sizeof(folders) / sizeof(folders[0]) };
 
-static void remove_new(const char *dir)
-{
-    char path[1024];
-    join(path, sizeof(path), dir, "take.json");
-    unlink(path);
-    for (int i = N_FOLDERS - 1; i >= 0; i--) {
-        join(path, sizeof(path), dir, folders[i]);
-        rmdir(path);
-    }
-    rmdir(dir);
-}
-
-int ledger_create(const struct ledger *l, const char *takes_dir)
-{
-    char dir[1024], final[1024], path[1200];
-    join(final, sizeof(final), takes_dir, l->id);
-    snprintf(dir, sizeof(dir), "%s/.%s.part", takes_dir, l->id);
-    int err = make_directories(takes_dir);
-    if (err)
-        return err;
-    remove_new(dir); // of an earlier life that ended here
-    char *text = ledger_text(l);
-    if (!text)
-        return -ENOMEM;
-    err = mkdir(dir, 0777) ? -errno : 0;
-    for (int i = 0; i < N_FOLDERS && !err; i++) {
-        join(path, sizeof(path), dir, folders[i]);
-        err = mkdir(path, 0777) ? -errno : 0;
-    }
-    if (!err) {
-        join(path, sizeof(path), dir, "geometry");
-        err = sync_folder(path);
-    }
-    if (!err)
-        err = ledger_commit(text, dir); // syncs dir as well
-    if (!err && renameat2(AT_FDCWD, dir, AT_FDCWD, final, RENAME_NOREPLACE))
-        err = -errno;
-    if (!err)
-        err = sync_folder(takes_dir);
-    free(text);
-    if (err) {
-        log_error("ledger: cannot create %s: %s", final, strerror(-err));
-        remove_new(dir);
-    }
-    return err;
-}
-
-// ---- after a crash -------------------------------------------------------------------------------------------------------------------
-
-static bool is_part(const char *name)
+static bool is_part(const char *name) // .NAME.tag.part of atomic_file, NAME.part of ingest; no camera's name holds a dot
 {
     const size_t n = strlen(name);
-    return name[0] == '.' && n > 6 && !strcmp(name + n - 5, ".part");
+    return n > 5 && !strcmp(name + n - 5, ".part");
 }
 
 static int remove_parts(const char *dir, int *n_removed)
@@ -531,6 +482,66 @@ static int remove_parts(const char *dir, int *n_removed)
     *n_removed += n;
     return n ? sync_folder(dir) : 0;
 }
+
+static void remove_new(const char *dir)
+{
+    char path[1024];
+    int n = 0;
+    remove_parts(dir, &n);
+    join(path, sizeof(path), dir, "take.json");
+    unlink(path);
+    for (int i = N_FOLDERS - 1; i >= 0; i--) {
+        join(path, sizeof(path), dir, folders[i]);
+        rmdir(path);
+    }
+    rmdir(dir);
+}
+
+int ledger_create(const char *text, const char *id, const char *takes_dir)
+{
+    char dir[1024], final[1024], path[1200];
+    join(final, sizeof(final), takes_dir, id);
+    snprintf(dir, sizeof(dir), "%s/.%s.part", takes_dir, id);
+    int err = make_directories(takes_dir);
+    if (err)
+        return err;
+    remove_new(dir); // of an earlier life that ended here
+    err = mkdir(dir, 0777) ? -errno : 0;
+    for (int i = 0; i < N_FOLDERS && !err; i++) {
+        join(path, sizeof(path), dir, folders[i]);
+        err = mkdir(path, 0777) ? -errno : 0;
+    }
+    if (!err) {
+        join(path, sizeof(path), dir, "geometry");
+        err = sync_folder(path);
+    }
+    if (!err)
+        err = ledger_commit(text, dir); // syncs dir as well
+    if (!err && renameat2(AT_FDCWD, dir, AT_FDCWD, final, RENAME_NOREPLACE))
+        err = -errno;
+    if (!err)
+        err = sync_folder(takes_dir);
+    if (err) {
+        log_error("ledger: cannot create %s: %s", final, strerror(-err));
+        remove_new(dir);
+    }
+    return err;
+}
+
+void ledger_remove_leftovers(const char *takes_dir)
+{
+    char path[1024];
+    DIR *d = opendir(takes_dir);
+    for (const struct dirent *e; d && (e = readdir(d));)
+        if (e->d_name[0] == '.' && is_part(e->d_name)) {
+            join(path, sizeof(path), takes_dir, e->d_name);
+            remove_new(path); // only what ledger_create makes; a folder with anything else in it stays
+        }
+    if (d)
+        closedir(d);
+}
+
+// ---- after a crash -------------------------------------------------------------------------------------------------------------------
 
 // Never deleted: somebody may want to know what happened to it.
 static int set_aside(const char *path)
@@ -600,7 +611,7 @@ int ledger_reconcile(struct ledger *l, const char *take_dir, struct ledger_findi
     join(path, sizeof(path), take_dir, "raw");
     DIR *d = err ? NULL : opendir(path);
     for (const struct dirent *e; d && (e = readdir(d));) {
-        bool known = e->d_name[0] == '.' || strstr(e->d_name, ".damaged");
+        bool known = e->d_name[0] == '.' || is_part(e->d_name) || strstr(e->d_name, ".damaged");
         for (int i = 0; i < l->n_cameras && !known; i++)
             for (int k = 0; k < l->camera[i].n_objects && !known; k++)
                 known = !strcmp(l->camera[i].object[k].file + 4, e->d_name);

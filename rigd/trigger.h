@@ -43,11 +43,12 @@ struct trigger_shot {
 int trigger_open(struct trigger **out, const struct config *config, const struct trigger_host *host);
 unsigned trigger_abilities(const struct trigger *t);
 
-// 0, -ETIME (at_ns - half_ms has passed), -EBUSY (a shot is pending), -EINVAL (hold or a delay beyond its limit).
+// 0, -ETIME (at_ns - half_ms has passed), -EBUSY (a shot is pending), -EINVAL (hold or a delay beyond its limit, half_ms, the longest
+// delay and hold_ms together beyond max_hold_ms, nobody left to press), -EIO (broken).
 int trigger_fire(struct trigger *t, const struct trigger_shot *shot);
 void trigger_release(struct trigger *t); // at once, also in the middle of a shot: fired() then comes with -ECANCELED
 
-// Cut (true) or give (false) the supply of one camera. 0, -ENOTSUP, -EIO.
+// Cut (true) or give (false) the supply of one camera; after max_hold_ms it is given back anyway. 0, -ENOTSUP, -EIO.
 int trigger_relay(struct trigger *t, int camera, bool cut);
 
 // For the loop: when fd is readable, call dispatch.

@@ -6,7 +6,7 @@
 #include "tests/rigsim/ptp.h"
 #include "tests/rigsim/ptpip.h"
 #include "tests/rigsim/raw_dng.h"
-#include "tests/rigsim/shutter_line.h"
+#include "rigd/shutter_line.h"
 #include "tests/scratch.h"
 
 #include "solver/take/image.h"

@@ -1,7 +1,7 @@
 // tests/rigsim/body.c - see body.h. All that will happen by itself is one list ordered by time; body_step() works it off.
 #include "tests/rigsim/body.h"
 #include "solver/random.h"
-#include "tests/rigsim/shutter_line.h"
+#include "rigd/shutter_line.h"
 
 #include <assert.h>
 #include <errno.h>

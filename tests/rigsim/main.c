@@ -30,7 +30,7 @@ static const struct argp_option options[] = {
     { "seed", OPTION_SEED, "S", 0, "of lags and noise (default 0)", 0 },
     { "clock", OPTION_CLOCK, "real|fixed", 0, "fixed: exposures are stamped 10 s apart, so that the same seed gives the same bytes", 0 },
     { "faults", OPTION_FAULTS, "FILE", 0, "script of what goes wrong (tests/rigsim/faults.h)", 0 },
-    { "trigger-socket", OPTION_TRIGGER, "PATH", 0, "shutter lines and flash-sync (tests/rigsim/shutter_line.h)", 0 },
+    { "trigger-socket", OPTION_TRIGGER, "PATH", 0, "shutter lines and flash-sync (rigd/shutter_line.h)", 0 },
     { "list", OPTION_LIST, NULL, 0, "print the cameras as sections of rigd.conf, and end", 0 },
     { 0 },
 };

@@ -5,7 +5,7 @@
 #include "tests/rigsim/ptp.h"
 #include "tests/rigsim/ptpip.h"
 #include "tests/rigsim/server.h"
-#include "tests/rigsim/shutter_line.h"
+#include "rigd/shutter_line.h"
 
 enum { LINKS_PER_CAMERA = 6, SHUTTER_CLIENTS_MAX = 16 };
 enum link_role { LINK_FREE, LINK_NEW, LINK_COMMAND, LINK_EVENT };

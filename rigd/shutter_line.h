@@ -1,4 +1,4 @@
-// tests/rigsim/shutter_line.h - the wires of the simulated rig: shutter cables in, flash-sync contacts out.
+// rigd/shutter_line.h - the wires of the simulated rig: shutter cables in, flash-sync contacts out.
 //
 // rigsim --trigger-socket PATH listens on a Unix socket of type SOCK_SEQPACKET (a message is a packet; an abstract name is
 // written "@name"). Whoever drives shutters (rigd's simulated trigger, the simulated board) connects to it; any number of
