@@ -53,10 +53,10 @@ FUZZED := $(TAKE) $(addprefix solver/,cameras.c cameras_bundler.c cameras_colmap
   cameras_metashape.c cameras_realitycapture.c csv.c lights.c mesh.c mesh_gltf_floats.c mesh_import.c orientation.c panorama.c parallel.c \
   picture_size.c texels.c xml.c) $(addprefix rigd/,camera.c config.c container.c control.c personality.c)
 TESTS := $(addprefix test_,alternating brdf cameras cameras_import compare csv disney emitters export gltf_brdf image joint json judge levels \
-  lights lm materials mesh misfit normal_equations orientation panorama parallel pcg photometric rays render report rigsim samples shapes stability \
+  lights lm materials mesh misfit normal_equations orientation panorama parallel pcg photometric rays render report rigsim rigsim_wire samples shapes stability \
   synth take texels vec3 visibility) check_kernels
 RIG_TESTS := $(addprefix test_,calibrate camera camera_worker config container control digest ingest ledger manifest personality rig trigger)
-FUZZERS := camera cameras cameras_import config container control csv exr hdr json lights mesh personality
+FUZZERS := camera cameras cameras_import config container control csv exr hdr json lights mesh personality ptpip
 
 # ---- rules --------------------------------------------------------------------------------------------------------------
 object = $(patsubst %.c,$(BUILD)/obj/%.o,$(1))
@@ -114,13 +114,17 @@ $(BUILD)/tests/%: $(BUILD)/obj/tests/%.o $(BUILD)/libstudiorig.a
 $(addprefix $(BUILD)/tests/,$(RIG_TESTS)): $(BUILD)/tests/%: $(BUILD)/obj/tests/%.o $(BUILD)/librig.a $(BUILD)/libtake.a
 	$(link_rig) -lcmocka $(LIBS_RIG) -o $@
 $(BUILD)/tests/test_camera_worker: | $(BUILD)/bin/rigd-camera $(BUILD)/bin/rigsim
-$(BUILD)/tests/test_rigsim $(BUILD)/tests/test_rigsim_wire: $(call object,$(RIGSIM_LIB))
+$(BUILD)/tests/test_rigsim: $(call object,$(RIGSIM_LIB))
+$(BUILD)/tests/test_rigsim: LIBS := $(BUILD)/libstudiorig.a $(LIBS)
+$(BUILD)/tests/test_rigsim_wire: $(call object,$(addprefix tests/rigsim/,client.c dataset.c ptpip.c)) | $(BUILD)/bin/rigsim
 $(BUILD)/tests/bench/stability_joint: $(call object,solver/commands/arguments.c)
 $(BUILD)/tests/test_pcg: LIBS += $(if $(wildcard /usr/include/suitesparse/cholmod.h),-lcholmod)
 $(BUILD)/fuzz/obj/%.o: %.c Makefile | deps-fuzz
 	@mkdir -p $(@D)
 	@$(if $(V),,echo '  CC (fuzz) $<')
 	$(Q)clang $(FUZZ_FLAGS) -MMD -MP -c $< -o $@
+$(BUILD)/fuzz/fuzz_ptpip: $(patsubst %.c,$(BUILD)/fuzz/obj/%.o,$(addprefix tests/rigsim/,body.c dataset.c personality.c personality_builtin.c ptp.c \
+  ptp_canon.c ptp_datasets.c ptp_nikon.c ptpip.c))
 $(BUILD)/fuzz/fuzz_%: $(BUILD)/fuzz/obj/tests/fuzz/fuzz_%.o $(patsubst %.c,$(BUILD)/fuzz/obj/%.o,$(FUZZED))
 	@$(if $(V),,echo '  LD (fuzz) $@')
 	$(Q)clang $(FUZZ_FLAGS) -fsanitize=fuzzer $^ $(LIBS) -linih -o $@
@@ -139,7 +143,7 @@ deps-bench: deps ; $(call install_packages,$(PACKAGES_BENCH))
 # ---- tests ----------------------------------------------------------------------------------------------------------------
 TEST_PROGRAMS := $(addprefix $(BUILD)/tests/,$(TESTS) $(RIG_TESTS))
 test: deps all $(TEST_PROGRAMS)
-	@CMOCKA_MESSAGE_OUTPUT=TAP BIN=$(BUILD)/bin prove --timer --merge --exec '' tests/check_includes.sh tests/check_gpiod.sh $(TEST_PROGRAMS) tests/test_commands.sh
+	@CMOCKA_MESSAGE_OUTPUT=TAP BIN=$(BUILD)/bin prove --timer --merge --exec '' tests/check_includes.sh tests/check_gpiod.sh $(TEST_PROGRAMS) tests/test_commands.sh tests/test_rigsim.sh
 $(BUILD)/tests/vm/test_gpio_vm: $(BUILD)/obj/tests/vm/test_gpio_vm.o $(BUILD)/librig.a $(BUILD)/libtake.a
 	$(link_rig) -Wl,--as-needed -lcmocka $(LIBS_RIG) -o $@
 test-vm: deps $(BUILD)/tests/vm/test_gpio_vm

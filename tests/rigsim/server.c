@@ -11,8 +11,8 @@
 #include <stdlib.h>
 #include <string.h>
 #include <sys/epoll.h>
+#include <sys/eventfd.h>
 #include <sys/resource.h>
-#include <sys/signalfd.h>
 #include <sys/socket.h>
 #include <sys/timerfd.h>
 #include <time.h>
@@ -363,7 +363,7 @@ int server_listen(struct camera *c)
                                        .sin_addr.s_addr = htonl(INADDR_LOOPBACK) };
         const int fd = socket(AF_INET, SOCK_STREAM | SOCK_NONBLOCK | SOCK_CLOEXEC, 0);
         if (fd < 0 || setsockopt(fd, SOL_SOCKET, SO_REUSEADDR, &on, sizeof(on)) ||
-            bind(fd, (const struct sockaddr *)&a, sizeof(a)) || listen(fd, 8)) {
+            bind(fd, (const struct sockaddr *)&a, sizeof(a)) || listen(fd, 64)) {
             const int err = -errno;
             log_error("rigsim: 127.0.0.1:%d for camera %s: %s; choose another --port", port, server_camera_name(c->index),
                       strerror(-err));
@@ -477,6 +477,19 @@ static int open_cameras(struct server *s)
 
 // ---- the loop ----------------------------------------------------------------------------------------------------------------
 
+// A handler, not a signalfd: libraries' own threads do not block what this one blocks.
+static int end_requested = -1;
+
+static void request_end(int signal_number)
+{
+    const uint64_t one = 1;
+    const int saved = errno;
+    (void)signal_number;
+    if (write(end_requested, &one, sizeof(one)) < 0)
+        _exit(1);
+    errno = saved;
+}
+
 static int open_server(struct server *s)
 {
     const struct server_settings *t = s->settings;
@@ -485,19 +498,17 @@ static int open_server(struct server *s)
         files.rlim_cur = files.rlim_max;
         setrlimit(RLIMIT_NOFILE, &files);
     }
-    sigset_t ends;
-    sigemptyset(&ends);
-    sigaddset(&ends, SIGTERM);
-    sigaddset(&ends, SIGINT);
-    sigprocmask(SIG_BLOCK, &ends, NULL);
     s->epoll = epoll_create1(EPOLL_CLOEXEC);
     s->timer = timerfd_create(CLOCK_MONOTONIC, TFD_CLOEXEC | TFD_NONBLOCK);
-    s->signals = signalfd(-1, &ends, SFD_CLOEXEC | SFD_NONBLOCK);
+    s->signals = end_requested = eventfd(0, EFD_CLOEXEC | EFD_NONBLOCK);
     if (s->epoll < 0 || s->timer < 0 || s->signals < 0) {
         const int err = -errno;
         log_error("rigsim: cannot make the loop: %s", strerror(-err));
         return err;
     }
+    const struct sigaction on_end = { .sa_handler = request_end };
+    sigaction(SIGTERM, &on_end, NULL);
+    sigaction(SIGINT, &on_end, NULL);
     int err = server_watch(s, s->timer, server_name(NAME_TIMER, 0, 0), false, true);
     err = err ? err : server_watch(s, s->signals, server_name(NAME_SIGNALS, 0, 0), false, true);
     err = err ? err : scene_open(&s->scene, t->scene, t->width_px, t->height_px, t->n_cameras, server_camera_name);

@@ -6,7 +6,7 @@
 
 #include <string.h>
 
-enum { GARBAGE_STREAM = 0x676172 };
+enum { GARBAGE_STREAM = 0x676172, FLOOD_PER_STEP = BODY_EVENTS_MAX / 2 };
 
 void server_power(struct camera *c, bool on, int64_t back_ns)
 {
@@ -15,8 +15,8 @@ void server_power(struct camera *c, bool on, int64_t back_ns)
     c->power_until_ns = back_ns;
     if (on)
         return;
+    server_refuse(c); // first, so that no client slips in between
     server_drop_links(c);
-    server_refuse(c);
     body_open_lines(&c->body);
 }
 
@@ -47,8 +47,8 @@ static void begin(struct camera *c, const struct fault *f)
         return;
     case FAULT_REFUSE:
         c->refuse_until_ns = now + f->ns;
-        server_drop_links(c);
         server_refuse(c);
+        server_drop_links(c);
         return;
     case FAULT_LOSE_ADDED:
         b->lose_object_added += (int)f->n;
@@ -139,7 +139,7 @@ void server_faults_step(struct camera *c)
         if (!c->body.faults.no_power)
             server_listen(c);
     }
-    for (int n = 0; c->flood_until_ns > now && c->flood_next_ns <= now && n < 1000; n++) {
+    for (int n = 0; c->flood_next_ns < c->flood_until_ns && c->flood_next_ns <= now && n < FLOOD_PER_STEP; n++) {
         const struct personality *p = c->body.personality;
         const struct body_event e = { .kind = BODY_PROPERTY_CHANGED, .value = p->property[n % p->n_properties].code };
         body_push_event(&c->body, e);
@@ -158,10 +158,10 @@ int64_t server_faults_next_ns(const struct camera *c)
             next = at;
     }
     const int64_t ends[] = { c->stall_until_ns, c->boot ? c->power_until_ns : 0, c->refuse_until_ns,
-                             c->flood_until_ns > now ? c->flood_next_ns : 0,
+                             c->flood_next_ns < c->flood_until_ns ? c->flood_next_ns : 0,
                              c->bytes_ahead > 0 ? c->bucket_ns + (int64_t)(c->bytes_ahead / c->bytes_per_s * 1e9) + 1 : 0 };
     for (size_t i = 0; i < sizeof(ends) / sizeof(ends[0]); i++)
-        if (ends[i] > now && ends[i] < next)
+        if (ends[i] && ends[i] < next && (ends[i] > now || i == 3)) // a flood may be behind
             next = ends[i];
     return next;
 }
