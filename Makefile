@@ -50,11 +50,12 @@ RIGSIM := $(RIGSIM_LIB) $(addprefix tests/rigsim/,main.c server.c server_faults.
 FUZZED := $(TAKE) $(addprefix solver/,cameras.c cameras_bundler.c cameras_colmap.c cameras_format.c cameras_meshroom.c \
   cameras_metashape.c cameras_realitycapture.c csv.c lights.c mesh.c mesh_gltf_floats.c mesh_import.c orientation.c panorama.c parallel.c \
   picture_size.c texels.c xml.c)
-TESTS := $(addprefix test_,alternating brdf cameras cameras_import compare csv disney emitters export gltf_brdf image joint json judge levels lights lm materials mesh misfit normal_equations orientation panorama parallel pcg photometric rays render report rigsim rigsim_wire samples shapes stability interreflection synth take texels vec3 visibility) check_kernels
+TESTS := $(addprefix test_,alternating brdf cameras cameras_import compare csv disney emitters export gltf_brdf image interreflection joint json judge levels lights lm materials mesh misfit normal_equations orientation panorama parallel pcg photometric rays render report rigsim rigsim_wire samples shapes stability synth take texels vec3 visibility) check_kernels
   synth take texels vec3 visibility) check_kernels
 RIG_TESTS := $(addprefix test_,calibrate camera camera_worker config container control digest ingest ledger manifest personality rig studios trigger)
-FUZZERS := cameras cameras_import csv exr hdr json lights mesh config control ptpip
+FUZZERS := cameras cameras_import csv exr hdr json lights mesh config control ptpip camera container personality
   picture_size.c texels.c xml.c) $(addprefix rigd/,config.c control.c)
+  picture_size.c texels.c xml.c) $(addprefix rigd/,camera.c config.c container.c control.c personality.c)
 
 # ---- rules --------------------------------------------------------------------------------------------------------------
 object = $(patsubst %.c,$(BUILD)/obj/%.o,$(1))
@@ -111,6 +112,7 @@ $(BUILD)/tests/%: $(BUILD)/obj/tests/%.o $(BUILD)/libstudiorig.a
 	$(Q)$(CC) $(CFLAGS_ALL) $^ -lcmocka $(LIBS) -o $@
 $(addprefix $(BUILD)/tests/,$(RIG_TESTS)): $(BUILD)/tests/%: $(BUILD)/obj/tests/%.o $(BUILD)/librig.a $(BUILD)/libtake.a
 	$(link_rig) -lcmocka $(LIBS_RIG) -o $@
+$(BUILD)/tests/test_camera_worker: | $(BUILD)/bin/rigd-camera $(BUILD)/bin/rigsim
 $(BUILD)/tests/test_rigsim: $(call object,$(RIGSIM_LIB))
 $(BUILD)/tests/test_rigsim: LIBS := $(BUILD)/libstudiorig.a $(LIBS)
 $(BUILD)/tests/test_rigsim_wire: $(call object,$(addprefix tests/rigsim/,client.c dataset.c ptpip.c)) | $(BUILD)/bin/rigsim

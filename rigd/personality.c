@@ -208,18 +208,20 @@ void personality_free(struct personality *p)
 // The i-th of the words that | separates.
 static bool alternative(const char *value, int i, char out[PERSONALITY_NAME])
 {
-    for (const char *s = value; s; s = strchr(s, '|'), s += s ? 1 : 0) {
-        if (i--)
-            continue;
-        s += strspn(s, " \t");
-        size_t n = strcspn(s, "|");
-        while (n && isspace((unsigned char)s[n - 1]))
-            n--;
-        memcpy(out, s, n);
-        out[n] = 0;
-        return true;
+    for (; i > 0 && value; i--) {
+        value = strchr(value, '|');
+        if (value)
+            value++;
     }
-    return false;
+    if (!value)
+        return false;
+    value += strspn(value, " \t");
+    size_t n = strcspn(value, "|");
+    while (n && isspace((unsigned char)value[n - 1]))
+        n--;
+    memcpy(out, value, n);
+    out[n] = 0;
+    return true;
 }
 
 static const char *value_of(const struct personality *p, const char *section, const char *key)
