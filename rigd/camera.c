@@ -271,7 +271,7 @@ int camera_command_decode(struct camera_command *out, const char *text, size_t n
     struct json *doc = NULL;
     char key[40];
     memset(out, 0, sizeof(*out));
-    if (n_bytes > CAMERA_MESSAGE_MAX || json_parse(&doc, text, n_bytes, "camera command"))
+    if (n_bytes > CAMERA_MESSAGE_MAX || json_parse(&doc, text, n_bytes, NULL))
         return -EINVAL;
     struct reader r = { doc, false };
     out->kind = take_word(&r, "do", command_names, CAMERA_N_COMMANDS);
@@ -330,7 +330,7 @@ int camera_event_decode(struct camera_event *out, const char *text, size_t n_byt
     struct json *doc = NULL;
     char key[40];
     memset(out, 0, sizeof(*out));
-    if (n_bytes > CAMERA_MESSAGE_MAX || json_parse(&doc, text, n_bytes, "camera event"))
+    if (n_bytes > CAMERA_MESSAGE_MAX || json_parse(&doc, text, n_bytes, NULL))
         return -EINVAL;
     struct reader r = { doc, false };
     out->kind = take_word(&r, "event", event_names, CAMERA_N_EVENTS);

@@ -144,7 +144,7 @@ struct camera_event {
 };
 
 // One message. encode: malloc'd text without NUL in *n_bytes, NULL without memory. decode: 0, or -EINVAL for anything that is
-// not a message of this protocol (broken JSON is logged by json.c; the caller knows which camera spoke); *out is zeroed then.
+// not a message of this protocol (not logged: the caller knows which camera spoke); *out is zeroed then.
 char *camera_command_encode(const struct camera_command *c, size_t *n_bytes);
 char *camera_event_encode(const struct camera_event *e, size_t *n_bytes);
 int camera_command_decode(struct camera_command *out, const char *text, size_t n_bytes);

@@ -22,7 +22,7 @@ void control_close(struct control *c); // NULL allowed; removes the socket file
 int control_fd(const struct control *c); // readable: call dispatch
 void control_dispatch(struct control *c);
 
-void control_reply(struct control *c, uint64_t token, struct json *result); // takes result
+void control_reply(struct control *c, uint64_t token, struct json *result); // takes result; to a token that was answered: nothing
 // code: a stable word ("busy", "not_ready", "unknown_camera", ...); text for people, with a remedy.
 void control_refuse(struct control *c, uint64_t token, const char *code, const char *text);
 void control_publish(struct control *c, const char *event, struct json *body); // to all subscribers; takes body

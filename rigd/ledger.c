@@ -472,18 +472,15 @@ static void remove_new(const char *dir)
     rmdir(dir);
 }
 
-int ledger_create(const struct ledger *l, const char *takes_dir)
+int ledger_create(const char *text, const char *id, const char *takes_dir)
 {
     char dir[1024], final[1024], path[1200];
-    join(final, sizeof(final), takes_dir, l->id);
-    snprintf(dir, sizeof(dir), "%s/.%s.part", takes_dir, l->id);
+    join(final, sizeof(final), takes_dir, id);
+    snprintf(dir, sizeof(dir), "%s/.%s.part", takes_dir, id);
     int err = make_directories(takes_dir);
     if (err)
         return err;
     remove_new(dir); // of an earlier life that ended here
-    char *text = ledger_text(l);
-    if (!text)
-        return -ENOMEM;
     err = mkdir(dir, 0777) ? -errno : 0;
     for (int i = 0; i < N_FOLDERS && !err; i++) {
         join(path, sizeof(path), dir, folders[i]);
@@ -499,7 +496,6 @@ int ledger_create(const struct ledger *l, const char *takes_dir)
         err = -errno;
     if (!err)
         err = sync_folder(takes_dir);
-    free(text);
     if (err) {
         log_error("ledger: cannot create %s: %s", final, strerror(-err));
         remove_new(dir);

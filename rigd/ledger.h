@@ -79,8 +79,9 @@ int ledger_commit(const char *text, const char *take_dir);      // take.json, du
 int ledger_read(struct ledger *out, const char *take_dir);      // 0, -ENOENT, -EINVAL (logged); *out zeroed on failure
 int ledger_parse(struct ledger *out, const char *text, size_t n_bytes, const char *name);
 
-// Create takes_dir/id with raw/, linear/ and geometry/cameras/ and its first ledger, durable. -EEXIST if there is one.
-int ledger_create(const struct ledger *l, const char *takes_dir);
+// Create takes_dir/id with raw/, thumbnails/, linear/ and geometry/cameras/ and its first ledger, whole and durable or not at all.
+// -EEXIST if there is one. 0 or -errno (logged).
+int ledger_create(const char *text, const char *id, const char *takes_dir);
 
 // Bring ledger and disk together after a crash: remove *.part, hash frames that are here but not yet noted (they become COPIED),
 // take back COPIED notes whose file is missing, short or different (the copy is set aside as <name>.damaged, never deleted).

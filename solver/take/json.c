@@ -32,14 +32,16 @@ int json_parse(struct json **out, const char *text, size_t n_bytes, const char *
     json_error_t error;
     *out = NULL;
     if (n_bytes > MAX_FILE_BYTES) {
-        log_error("json: %s: %zu bytes, at most %d are read", name_for_errors, n_bytes,
-                  MAX_FILE_BYTES);
+        if (name_for_errors)
+            log_error("json: %s: %zu bytes, at most %d are read", name_for_errors, n_bytes,
+                      MAX_FILE_BYTES);
         return -EFBIG;
     }
     json_t *v = json_loadb(text, n_bytes, JSON_REJECT_DUPLICATES, &error);
     if (!v) {
         const bool no_memory = json_error_code(&error) == json_error_out_of_memory;
-        log_error("json: %s:%d:%d: %s", name_for_errors, error.line, error.column, error.text);
+        if (name_for_errors)
+            log_error("json: %s:%d:%d: %s", name_for_errors, error.line, error.column, error.text);
         return no_memory ? -ENOMEM : -EINVAL;
     }
     *out = json_of(v);

@@ -13,6 +13,7 @@ struct json; // a value; owned by its document
 
 // Read a file. Errors (logged with line and column): -errno of the open, -EFBIG, -EINVAL (not JSON).
 int json_read(struct json **out, const char *path);
+// name_for_errors NULL: nothing is logged (text from a socket: its sender must not fill the log).
 int json_parse(struct json **out, const char *text, size_t n_bytes, const char *name_for_errors);
 // Write atomically, indented by 1, keys in the order of insertion, doubles with 17 digits. 0 or -errno (logged).
 int json_write(const struct json *doc, const char *path);

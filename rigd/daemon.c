@@ -1,0 +1,1285 @@
+// rigd/daemon.c - the loop around the rig: workers, timers, the disk's thread, the trigger, clients, systemd.
+//
+// One thread does everything but touch the disk; a second one does that, job after job, so that a slow fsync holds up no camera. After
+// each event the rig's actions are carried out and its next deadline is set (look_at_rig). Decisions are the rig's, not made here.
+#include "rigd/daemon.h"
+#include "rigd/control.h"
+#include "rigd/describe.h"
+#include "rigd/doctor.h"
+#include "rigd/manifest.h"
+#include "rigd/rig.h"
+#include "solver/take/atomic_file.h"
+#include "solver/take/log.h"
+
+#include <ctype.h>
+#include <dirent.h>
+#include <errno.h>
+#include <fcntl.h>
+#include <limits.h>
+#include <pthread.h>
+#include <signal.h>
+#include <spawn.h>
+#include <stdio.h>
+#include <stdlib.h>
+#include <string.h>
+#include <sys/eventfd.h>
+#include <sys/resource.h>
+#include <sys/socket.h>
+#include <sys/statvfs.h>
+#include <sys/wait.h>
+#include <systemd/sd-daemon.h>
+#include <systemd/sd-event.h>
+#include <systemd/sd-journal.h>
+#include <time.h>
+#include <unistd.h>
+
+#define S INT64_C(1000000000)
+enum { TRIGGER_RETRY_S = 5, WORKERS_END_MS = 1500 };
+
+struct daemon;
+
+struct worker {
+    struct daemon *daemon;
+    int camera, fd;
+    pid_t pid; // 0: none
+    sd_event_source *io, *child;
+};
+
+// Work for the disk's thread. work runs there and touches nothing but its job; done runs in the loop.
+struct job {
+    void (*work)(struct job *job);
+    void (*done)(struct daemon *d, struct job *job);
+    struct job *next;
+    int err;
+    int64_t value;
+    char dir[600], id[96]; // of the take, or of all takes
+    char *text;
+    struct ledger ledger;
+    struct manifest_known *known;
+    int n_known;
+    char (*paths)[64];
+    char (*hashes)[33];
+    uint64_t token;
+};
+
+struct daemon {
+    struct config config;
+    char takes_dir[300], worker_path[PATH_MAX];
+    bool once, once_started, to_journal, stopping;
+    int exit_code;
+    struct rig *rig;
+    struct control *control;
+    struct trigger *trigger;
+    const char *trigger_word;
+    struct worker *worker;
+    sd_event *event;
+    sd_event_source *timer, *trigger_io, *trigger_timer;
+    struct counters counters;
+    int64_t take_began_ns;
+    // requests that are answered later
+    uint64_t take_token, preflight_token, lag_token, identify_token[CONFIG_CAMERAS_MAX];
+    // takes to be finished
+    char (*unfinished)[96];
+    int n_unfinished;
+    uint64_t resume_token; // of the first
+    bool resuming;
+    // disk
+    pthread_t disk;
+    bool disk_runs;
+    pthread_mutex_t lock;
+    pthread_cond_t wake;
+    struct job *todo, *finished;
+    bool disk_ends;
+    int finished_fd;
+};
+
+static int64_t now_ns(void)
+{
+    struct timespec t;
+    clock_gettime(CLOCK_MONOTONIC, &t);
+    return t.tv_sec * S + t.tv_nsec;
+}
+
+static int64_t utc_ms(void)
+{
+    struct timespec t;
+    clock_gettime(CLOCK_REALTIME, &t);
+    return (int64_t)t.tv_sec * 1000 + t.tv_nsec / 1000000;
+}
+
+// ---- the disk's thread -----------------------------------------------------------------------------------------------------------
+
+static void job_free(struct job *j)
+{
+    free(j->text);
+    free(j->known);
+    free(j->paths);
+    free(j->hashes);
+    ledger_free(&j->ledger);
+    free(j);
+}
+
+static struct job *take_job(struct daemon *d, bool wait)
+{
+    struct job *j;
+    pthread_mutex_lock(&d->lock);
+    while (wait && !d->todo && !d->disk_ends)
+        pthread_cond_wait(&d->wake, &d->lock);
+    j = d->todo;
+    if (j)
+        d->todo = j->next;
+    pthread_mutex_unlock(&d->lock);
+    return j;
+}
+
+static void *disk_thread(void *arg)
+{
+    struct daemon *d = arg;
+    for (struct job *j; (j = take_job(d, true));) {
+        const uint64_t one = 1;
+        j->next = NULL;
+        j->work(j);
+        pthread_mutex_lock(&d->lock);
+        struct job **end = &d->finished;
+        while (*end)
+            end = &(*end)->next;
+        *end = j;
+        pthread_mutex_unlock(&d->lock);
+        if (write(d->finished_fd, &one, sizeof(one)) < 0)
+            break; // the loop is gone
+    }
+    return NULL;
+}
+
+static struct job *new_job(void (*work)(struct job *), void (*done)(struct daemon *, struct job *))
+{
+    struct job *j = calloc(1, sizeof(*j));
+    if (!j)
+        abort(); // systemd starts us again, and the takes are resumed
+    j->work = work;
+    j->done = done;
+    return j;
+}
+
+static void give(struct daemon *d, struct job *j)
+{
+    pthread_mutex_lock(&d->lock);
+    struct job **end = &d->todo;
+    while (*end)
+        end = &(*end)->next;
+    *end = j;
+    pthread_cond_signal(&d->wake);
+    pthread_mutex_unlock(&d->lock);
+}
+
+static int on_finished(sd_event_source *source, int fd, uint32_t events, void *arg)
+{
+    struct daemon *d = arg;
+    uint64_t n;
+    (void)source, (void)events;
+    if (read(fd, &n, sizeof(n)) < 0)
+        return 0;
+    pthread_mutex_lock(&d->lock);
+    struct job *list = d->finished;
+    d->finished = NULL;
+    pthread_mutex_unlock(&d->lock);
+    while (list) {
+        struct job *next = list->next;
+        list->done(d, list);
+        job_free(list);
+        list = next;
+    }
+    return 0;
+}
+
+static void work_space(struct job *j)
+{
+    struct statvfs s;
+    j->err = make_directories(j->dir);
+    if (!j->err && statvfs(j->dir, &s))
+        j->err = -errno;
+    j->value = j->err ? j->err : s.f_bavail > (uint64_t)INT64_MAX / s.f_frsize ? INT64_MAX : (int64_t)(s.f_bavail * s.f_frsize);
+}
+
+static void done_space(struct daemon *d, struct job *j)
+{
+    rig_space(d->rig, now_ns(), j->value);
+}
+
+static void work_create(struct job *j)
+{
+    j->err = j->text ? ledger_create(j->text, j->id, j->dir) : -ENOMEM;
+}
+
+static void work_commit(struct job *j)
+{
+    j->err = j->text ? ledger_commit(j->text, j->dir) : -ENOMEM;
+}
+
+static void done_commit(struct daemon *d, struct job *j)
+{
+    rig_committed(d->rig, now_ns(), j->err);
+}
+
+static void work_manifest(struct job *j)
+{
+    j->err = manifest_write(j->dir, j->known, j->n_known, j->value);
+}
+
+static void done_manifest(struct daemon *d, struct job *j)
+{
+    rig_manifest_written(d->rig, now_ns(), j->err);
+}
+
+static void take_dir(const struct daemon *d, const char *id, char *out, size_t room)
+{
+    snprintf(out, room, "%s/%s", d->takes_dir, id);
+}
+
+static void know_copies(struct job *j, const struct ledger *l)
+{
+    int n = 0;
+    for (int i = 0; i < l->n_cameras; i++)
+        n += l->camera[i].n_objects;
+    j->known = calloc((size_t)n + 1, sizeof(*j->known));
+    j->paths = calloc((size_t)n + 1, sizeof(*j->paths));
+    j->hashes = calloc((size_t)n + 1, sizeof(*j->hashes));
+    for (int i = 0; j->known && j->paths && j->hashes && i < l->n_cameras; i++)
+        for (int k = 0; k < l->camera[i].n_objects; k++) {
+            const struct ledger_object *o = &l->camera[i].object[k];
+            if (o->state != OBJECT_COPIED && o->state != OBJECT_DELETED)
+                continue;
+            memcpy(j->paths[j->n_known], o->file, sizeof(o->file));
+            memcpy(j->hashes[j->n_known], o->xxh128, sizeof(o->xxh128));
+            j->known[j->n_known] = (struct manifest_known){ j->paths[j->n_known], j->hashes[j->n_known], o->object.size_bytes };
+            j->n_known++;
+        }
+}
+
+// ---- telling people -----------------------------------------------------------------------------------------------------------------
+
+static void to_journal(void *arg, enum log_level level, const char *message)
+{
+    static const int priorities[] = { 7, 6, 4, 3 };
+    (void)arg;
+    if (level >= LOG_INFO && level < LOG_SILENT)
+        sd_journal_send("MESSAGE=%s", message, "PRIORITY=%d", priorities[level], "SYSLOG_IDENTIFIER=rigd", NULL);
+}
+
+static void tell(struct daemon *d, const struct rig_action *a)
+{
+    static const char *const words[] = { "info", "warning", "error" };
+    static const enum log_level levels[] = { LOG_INFO, LOG_WARNING, LOG_ERROR };
+    static const int priorities[] = { 6, 4, 3 };
+    const struct config_camera *c = a->camera == CONFIG_NONE ? NULL : &d->config.camera[a->camera];
+    const struct ledger *l = rig_ledger(d->rig);
+    if (d->to_journal)
+        sd_journal_send("MESSAGE=%s", a->text, "PRIORITY=%d", priorities[a->severity], "SYSLOG_IDENTIFIER=rigd", "RIGD_CAMERA=%s", c ? c->name : "", "RIGD_SLOT=%s", c ? c->port : "",
+                        "RIGD_TAKE=%s", l && rig_is_busy(d->rig) ? l->id : "", NULL);
+    else
+        log_line(levels[a->severity], "rig: %s", a->text);
+    struct json *o = json_new_object();
+    json_set_string(o, "severity", words[a->severity]);
+    if (c) {
+        json_set_string(o, "camera", c->name);
+        json_set_string(o, "port", c->port);
+    }
+    json_set_string(o, "text", a->text);
+    control_publish(d->control, "say", o);
+    if (a->severity == RIG_ERROR && c && strstr(a->text, "quarantined"))
+        d->counters.n_quarantines++;
+}
+
+// ---- workers ----------------------------------------------------------------------------------------------------------------------------
+
+static void forget_worker(struct worker *w)
+{
+    w->io = sd_event_source_disable_unref(w->io);
+    w->child = sd_event_source_disable_unref(w->child);
+    if (w->fd >= 0)
+        close(w->fd);
+    w->fd = -1;
+    w->pid = 0;
+}
+
+// What a worker has said and nobody has read yet. A worker that talks nonsense is killed.
+static void hear(struct worker *w)
+{
+    static char packet[CAMERA_MESSAGE_MAX + 1];
+    struct daemon *d = w->daemon;
+    while (w->fd >= 0) {
+        const ssize_t n = recv(w->fd, packet, sizeof(packet), MSG_DONTWAIT | MSG_TRUNC);
+        struct camera_event e;
+        if (n <= 0) {
+            if (n == 0) // its end is closed: its exit follows
+                w->io = sd_event_source_disable_unref(w->io);
+            return;
+        }
+        if (n > CAMERA_MESSAGE_MAX || camera_event_decode(&e, packet, (size_t)n)) {
+            log_error("rigd: camera %s: its worker sent %zd bytes that are no message; killed", d->config.camera[w->camera].name, n);
+            kill(w->pid, SIGKILL);
+            w->io = sd_event_source_disable_unref(w->io);
+            return;
+        }
+        rig_camera_event(d->rig, now_ns(), w->camera, &e);
+    }
+}
+
+static int on_worker(sd_event_source *source, int fd, uint32_t events, void *arg)
+{
+    (void)source, (void)fd, (void)events;
+    hear(arg);
+    return 0;
+}
+
+static int on_worker_end(sd_event_source *source, const siginfo_t *si, void *arg)
+{
+    struct worker *w = arg;
+    char how[80];
+    (void)source;
+    hear(w); // a copy that was finished with its last breath
+    if (si->si_code == CLD_EXITED)
+        snprintf(how, sizeof(how), "exit %d", si->si_status);
+    else
+        snprintf(how, sizeof(how), "%s", strsignal(si->si_status));
+    forget_worker(w);
+    rig_worker_gone(w->daemon->rig, now_ns(), w->camera, how);
+    return 0;
+}
+
+static int spawn_worker(struct daemon *d, struct worker *w)
+{
+    int fd[2], err;
+    posix_spawn_file_actions_t files;
+    posix_spawnattr_t attributes;
+    sigset_t none, all;
+    char *argv[] = { d->worker_path, d->config.camera[w->camera].name, NULL };
+    if (socketpair(AF_UNIX, SOCK_SEQPACKET | SOCK_CLOEXEC, 0, fd))
+        return -errno;
+    const int room = 2 * CAMERA_MESSAGE_MAX;
+    setsockopt(fd[0], SOL_SOCKET, SO_SNDBUF, &room, sizeof(room));
+    setsockopt(fd[1], SOL_SOCKET, SO_SNDBUF, &room, sizeof(room));
+    sigemptyset(&none);
+    sigfillset(&all);
+    posix_spawn_file_actions_init(&files);
+    posix_spawnattr_init(&attributes);
+    posix_spawn_file_actions_adddup2(&files, fd[1], CAMERA_FD);
+    posix_spawn_file_actions_addclosefrom_np(&files, CAMERA_FD + 1);
+    posix_spawnattr_setsigmask(&attributes, &none);
+    posix_spawnattr_setsigdefault(&attributes, &all);
+    posix_spawnattr_setflags(&attributes, POSIX_SPAWN_SETSIGMASK | POSIX_SPAWN_SETSIGDEF);
+    err = -posix_spawn(&w->pid, d->worker_path, &files, &attributes, argv, environ);
+    posix_spawnattr_destroy(&attributes);
+    posix_spawn_file_actions_destroy(&files);
+    close(fd[1]);
+    if (err) {
+        w->pid = 0;
+        close(fd[0]);
+        return err;
+    }
+    w->fd = fd[0];
+    err = sd_event_add_io(d->event, &w->io, w->fd, EPOLLIN, on_worker, w);
+    if (err >= 0)
+        err = sd_event_add_child(d->event, &w->child, w->pid, WEXITED, on_worker_end, w);
+    if (err < 0) {
+        kill(w->pid, SIGKILL);
+        waitpid(w->pid, NULL, 0);
+        forget_worker(w);
+        return err;
+    }
+    return 0;
+}
+
+static void start_worker(struct daemon *d, int camera)
+{
+    char how[80];
+    const int err = spawn_worker(d, &d->worker[camera]);
+    if (!err)
+        return;
+    log_error("rigd: cannot start %s: %s", d->worker_path, strerror(-err));
+    snprintf(how, sizeof(how), "cannot start: %.60s", strerror(-err));
+    rig_worker_gone(d->rig, now_ns(), camera, how);
+}
+
+static void send_command(struct daemon *d, int camera, const struct camera_command *c)
+{
+    struct worker *w = &d->worker[camera];
+    size_t n;
+    char *text = camera_command_encode(c, &n);
+    if (w->fd < 0 || !text || send(w->fd, text, n, MSG_DONTWAIT | MSG_NOSIGNAL) != (ssize_t)n) {
+        log_warning("rigd: camera %s: its worker does not take commands; killed", d->config.camera[camera].name);
+        if (w->pid > 0)
+            kill(w->pid, SIGKILL);
+    }
+    free(text);
+}
+
+// The kernel's own switch of a hub's port (Linux 6.0 and later), where the hub has one.
+static void switch_power(struct daemon *d, int camera, bool on)
+{
+    const char *power = d->config.camera[camera].power, *colon = strchr(power, ':');
+    char path[300];
+    if (!colon)
+        return;
+    const int n = (int)(colon - power);
+    snprintf(path, sizeof(path), "/sys/bus/usb/devices/%.*s:1.0/%.*s-port%s/disable", n, power, n, power, colon + 1);
+    const int fd = open(path, O_WRONLY | O_CLOEXEC);
+    if (fd < 0 || write(fd, on ? "0" : "1", 1) != 1)
+        log_warning("rigd: cannot switch %s: %s; this hub or kernel cannot, or rigd may not", path, strerror(errno));
+    if (fd >= 0)
+        close(fd);
+}
+
+// ---- trigger -------------------------------------------------------------------------------------------------------------------------------
+
+static void on_fired(void *arg, int err, int64_t pressed_ns, int64_t late_ns)
+{
+    struct daemon *d = arg;
+    rig_fired(d->rig, now_ns(), err, pressed_ns, late_ns);
+}
+
+static void on_feedback(void *arg, int camera, int64_t at_ns)
+{
+    struct daemon *d = arg;
+    rig_feedback(d->rig, now_ns(), camera, at_ns);
+}
+
+static void on_press_camera(void *arg, int camera)
+{
+    struct daemon *d = arg;
+    rig_press_camera(d->rig, now_ns(), camera);
+}
+
+static int capture(struct daemon *d, const char *name, bool without_missing, char *why);
+
+static void on_button(void *arg, int64_t at_ns)
+{
+    struct daemon *d = arg;
+    char why[200];
+    (void)at_ns;
+    if (capture(d, "button", false, why))
+        log_warning("rigd: the button was pressed: %s", why);
+}
+
+static void on_trigger_broken(void *arg, int err)
+{
+    struct daemon *d = arg;
+    log_error("rigd: the trigger is gone: %s; it is opened again every %d s", strerror(-err), TRIGGER_RETRY_S);
+    rig_trigger_is(d->rig, now_ns(), -1);
+    d->trigger_word = "broken";
+    sd_event_source_set_time_relative(d->trigger_timer, 100000); // not from within its own dispatch
+    sd_event_source_set_enabled(d->trigger_timer, SD_EVENT_ONESHOT);
+}
+
+static int on_trigger(sd_event_source *source, int fd, uint32_t events, void *arg)
+{
+    struct daemon *d = arg;
+    (void)source, (void)fd, (void)events;
+    trigger_dispatch(d->trigger);
+    return 0;
+}
+
+static int open_the_trigger(sd_event_source *source, uint64_t usec, void *arg)
+{
+    struct daemon *d = arg;
+    const struct trigger_host host = { on_fired, on_feedback, on_button, on_press_camera, on_trigger_broken, d };
+    static const char *const kinds[] = { "software (unsynchronised)", "gpio", "usb", "simulated" };
+    (void)usec;
+    d->trigger_io = sd_event_source_disable_unref(d->trigger_io);
+    trigger_close(d->trigger);
+    d->trigger = NULL;
+    int err = trigger_open(&d->trigger, &d->config, &host);
+    if (!err)
+        err = sd_event_add_io(d->event, &d->trigger_io, trigger_fd(d->trigger), EPOLLIN, on_trigger, d);
+    d->trigger_word = err < 0 ? "not there" : kinds[d->config.trigger.kind];
+    rig_trigger_is(d->rig, now_ns(), err < 0 ? -1 : (int)trigger_abilities(d->trigger));
+    if (err < 0) {
+        sd_event_source_set_time_relative(source, TRIGGER_RETRY_S * 1000000);
+        sd_event_source_set_enabled(source, SD_EVENT_ONESHOT);
+    }
+    return 0;
+}
+
+static void fire(struct daemon *d, const struct trigger_shot *shot)
+{
+    int err = d->trigger ? trigger_fire(d->trigger, shot) : -ENODEV;
+    if (err == -EIO)
+        err = -ENODEV; // refused: nothing was pressed
+    if (err)
+        rig_fired(d->rig, now_ns(), err, 0, 0);
+}
+
+// ---- takes ---------------------------------------------------------------------------------------------------------------------------------
+
+static int capture(struct daemon *d, const char *name, bool without_missing, char *why)
+{
+    char plain[41], id[96], created[40], stamp[40];
+    const int64_t utc = utc_ms();
+    const time_t t = (time_t)(utc / 1000);
+    struct tm tm;
+    size_t n = 0;
+    for (; name[n] && n < sizeof(plain) - 1; n++)
+        plain[n] = isalnum((unsigned char)name[n]) && (unsigned char)name[n] < 0x80 ? name[n] : '-';
+    plain[n] = 0;
+    gmtime_r(&t, &tm);
+    strftime(created, sizeof(created), "%Y-%m-%dT%H:%M:%SZ", &tm);
+    strftime(stamp, sizeof(stamp), "%Y%m%dT%H%M%S", &tm);
+    snprintf(id, sizeof(id), "%s%03d_%s", stamp, (int)(utc % 1000), plain);
+    const struct rig_take take = { .id = id, .name = plain, .created = created, .utc_ms = utc, .takes_dir = d->takes_dir };
+    d->take_began_ns = now_ns();
+    return rig_capture(d->rig, now_ns(), &take, without_missing, why);
+}
+
+static void count_take(struct daemon *d, const struct ledger *l)
+{
+    d->counters.n_takes++;
+    d->counters.n_verified += l->state == TAKE_VERIFIED;
+    d->counters.n_failed += l->state == TAKE_FAILED;
+    d->counters.last_take_s = 1e-9 * (double)(now_ns() - d->take_began_ns);
+    for (int i = 0; i < l->n_cameras; i++)
+        for (int k = 0; k < l->camera[i].n_objects; k++)
+            if (l->camera[i].object[k].state == OBJECT_COPIED || l->camera[i].object[k].state == OBJECT_DELETED) {
+                d->counters.n_frames++;
+                d->counters.n_bytes += l->camera[i].object[k].object.size_bytes;
+            }
+}
+
+static void next_unfinished(struct daemon *d)
+{
+    memmove(d->unfinished, d->unfinished + 1, (size_t)--d->n_unfinished * sizeof(*d->unfinished));
+    d->resuming = false;
+    d->resume_token = 0;
+}
+
+static void take_is_done(struct daemon *d)
+{
+    const struct ledger *l = rig_ledger(d->rig);
+    struct json *report = describe_take(l, false);
+    const double seconds = 1e-9 * (double)(now_ns() - d->take_began_ns);
+    count_take(d, l);
+    json_set_number(report, "seconds", seconds);
+    log_info("rigd: take %s: %s after %.2f s%s%s", l->id, take_state_name(l->state), seconds, l->reason[0] ? ": " : "", l->reason);
+    control_reply(d->control, d->resuming ? d->resume_token : d->take_token, report);
+    control_publish(d->control, "take", describe_take(l, false));
+    if (d->resuming) {
+        next_unfinished(d);
+        return;
+    }
+    d->take_token = 0;
+    if (d->once) {
+        d->exit_code = l->state == TAKE_VERIFIED ? 0 : 1;
+        sd_event_exit(d->event, 0);
+    }
+}
+
+static void work_reconcile(struct job *j)
+{
+    struct ledger_findings found;
+    char path[700];
+    snprintf(path, sizeof(path), "%s/%s", j->dir, j->id);
+    j->err = ledger_read(&j->ledger, path);
+    if (!j->err)
+        j->err = ledger_reconcile(&j->ledger, path, &found);
+    if (!j->err)
+        j->err = ledger_bound(&j->ledger, j->dir);
+    if (!j->err && (found.n_adopted || found.n_taken_back || found.n_parts_removed))
+        log_info("rigd: take %s: %d copies adopted, %d taken back, %d leftovers removed", j->id, found.n_adopted, found.n_taken_back, found.n_parts_removed);
+}
+
+static void done_reconcile(struct daemon *d, struct job *j)
+{
+    char why[200] = "";
+    int err = j->err;
+    if (err)
+        snprintf(why, sizeof(why), "its ledger or its frames cannot be read: %s; see the journal", strerror(-err));
+    else
+        err = rig_resume(d->rig, now_ns(), &j->ledger, d->takes_dir, why);
+    if (err == -EBUSY) {
+        d->resuming = false; // a take came between: later
+        return;
+    }
+    if (!err)
+        return;
+    log_error("rigd: take %s cannot be resumed: %s", j->id, why);
+    control_refuse(d->control, d->resume_token, "cannot_resume", why);
+    next_unfinished(d);
+}
+
+static bool cameras_settle(const struct daemon *d)
+{
+    for (int i = 0; i < d->config.n_cameras; i++) {
+        const enum rig_condition c = rig_camera(d->rig, i).condition;
+        if (c != RIG_READY && c != RIG_QUARANTINED)
+            return false;
+    }
+    return true;
+}
+
+// With nothing else to do: finish what an earlier life left, one take after the other; then --once takes its picture.
+static void look_for_work(struct daemon *d)
+{
+    if (d->resuming || d->stopping || rig_is_busy(d->rig) || !cameras_settle(d))
+        return;
+    if (d->n_unfinished) {
+        struct job *j = new_job(work_reconcile, done_reconcile);
+        d->resuming = true;
+        d->take_began_ns = now_ns();
+        snprintf(j->dir, sizeof(j->dir), "%s", d->takes_dir);
+        snprintf(j->id, sizeof(j->id), "%s", d->unfinished[0]);
+        log_info("rigd: take %s is not finished; looking for its frames", j->id);
+        give(d, j);
+    } else if (d->once && !d->once_started) {
+        char why[200];
+        d->once_started = true;
+        if (capture(d, "once", false, why)) {
+            log_error("rigd: %s", why);
+            d->exit_code = 1;
+            sd_event_exit(d->event, 0);
+        }
+    }
+}
+
+static bool add_unfinished(struct daemon *d, const char *id)
+{
+    void *grown = realloc(d->unfinished, ((size_t)d->n_unfinished + 1) * sizeof(*d->unfinished));
+    if (!grown)
+        return false;
+    d->unfinished = grown;
+    snprintf(d->unfinished[d->n_unfinished++], sizeof(*d->unfinished), "%s", id);
+    return true;
+}
+
+static void find_unfinished(struct daemon *d)
+{
+    struct dirent **entries = NULL;
+    const int n = scandir(d->takes_dir, &entries, NULL, alphasort);
+    for (int i = 0; i < n; i++) {
+        char path[700];
+        struct ledger l;
+        take_dir(d, entries[i]->d_name, path, sizeof(path));
+        if (entries[i]->d_name[0] != '.' && !ledger_read(&l, path)) {
+            if (l.state != TAKE_VERIFIED && l.state != TAKE_DEVELOPED && l.state != TAKE_SOLVED && l.state != TAKE_FAILED && !strcmp(l.id, entries[i]->d_name))
+                add_unfinished(d, l.id);
+            ledger_free(&l);
+        }
+        free(entries[i]);
+    }
+    free(entries);
+}
+
+// ---- lag ---------------------------------------------------------------------------------------------------------------------------------
+
+static void lag_path(const struct daemon *d, char *out, size_t room)
+{
+    snprintf(out, room, "%s/lag.json", d->config.state_dir);
+}
+
+static void keep_lag(struct daemon *d)
+{
+    char path[400], when[40];
+    const time_t t = time(NULL);
+    struct tm tm;
+    const char *serial[CONFIG_CAMERAS_MAX];
+    struct lag lag[CONFIG_CAMERAS_MAX];
+    for (int i = 0; i < d->config.n_cameras; i++) {
+        const struct rig_camera_view v = rig_camera(d->rig, i);
+        serial[i] = v.facts->serial;
+        lag[i] = v.lag;
+    }
+    gmtime_r(&t, &tm);
+    strftime(when, sizeof(when), "%Y-%m-%dT%H:%M:%SZ", &tm);
+    lag_path(d, path, sizeof(path));
+    if (!rig_outcome(d->rig)[0] && !make_directories(d->config.state_dir))
+        lag_write(path, &d->config, serial, lag, when); // says what is wrong itself
+    control_reply(d->control, d->lag_token, describe_lag(d->rig, &d->config));
+    d->lag_token = 0;
+}
+
+// ---- requests ----------------------------------------------------------------------------------------------------------------------------
+
+static int camera_named(const struct daemon *d, const struct json *request)
+{
+    const char *name = "";
+    json_get_string(request, "camera", &name);
+    for (int i = 0; i < d->config.n_cameras; i++)
+        if (!strcasecmp(d->config.camera[i].name, name))
+            return i;
+    return -1;
+}
+
+static void refuse(struct daemon *d, uint64_t token, int err, const char *why)
+{
+    control_refuse(d->control, token, err == -EBUSY ? "busy" : err == -ENOTCONN ? "no_trigger" : "refused", why);
+}
+
+static void ask_capture(struct daemon *d, uint64_t token, const struct json *request)
+{
+    const char *name = "take";
+    bool without_missing = false;
+    char why[200];
+    json_get_string(request, "name", &name);
+    json_get_bool(request, "without_missing", &without_missing);
+    const int err = d->n_unfinished ? -EBUSY : capture(d, name, without_missing, why);
+    if (d->n_unfinished)
+        snprintf(why, sizeof(why), "an unfinished take is being collected; wait for it");
+    if (err)
+        refuse(d, token, err, why);
+    else
+        d->take_token = token;
+}
+
+static void ask_preflight(struct daemon *d, uint64_t token, const struct json *request)
+{
+    char why[200];
+    (void)request;
+    const int err = rig_preflight(d->rig, now_ns(), why);
+    if (err)
+        refuse(d, token, err, why);
+    else
+        d->preflight_token = token;
+}
+
+static void ask_calibrate(struct daemon *d, uint64_t token, const struct json *request)
+{
+    const char *what = "";
+    int64_t shots = d->config.calibration_shots;
+    char why[200];
+    json_get_string(request, "what", &what);
+    json_get_int(request, "shots", &shots);
+    int err = -EINVAL;
+    if (strcmp(what, "lag"))
+        snprintf(why, sizeof(why), "found calibrate '%.40s', expected lag", what);
+    else
+        err = rig_calibrate(d->rig, now_ns(), shots > 0 && shots <= 1000 ? (int)shots : 0, why);
+    if (err)
+        refuse(d, token, err, why);
+    else
+        d->lag_token = token;
+}
+
+static void ask_identify(struct daemon *d, uint64_t token, const struct json *request)
+{
+    char why[200];
+    const int i = camera_named(d, request);
+    const int err = rig_identify(d->rig, now_ns(), i, why);
+    if (err)
+        refuse(d, token, err, why);
+    else
+        d->identify_token[i] = token;
+}
+
+static void ask_reinstate(struct daemon *d, uint64_t token, const struct json *request)
+{
+    char why[200];
+    const int err = rig_reinstate(d->rig, now_ns(), camera_named(d, request), why);
+    if (err)
+        refuse(d, token, err, why);
+    else
+        control_reply(d->control, token, json_new_object());
+}
+
+static void ask_cancel(struct daemon *d, uint64_t token, const struct json *request)
+{
+    char why[200];
+    (void)request;
+    const int err = rig_cancel(d->rig, now_ns(), why);
+    if (err)
+        refuse(d, token, err, why);
+    else
+        control_reply(d->control, token, json_new_object());
+}
+
+static void ask_status(struct daemon *d, uint64_t token, const struct json *request)
+{
+    (void)request;
+    control_reply(d->control, token, describe_status(d->rig, &d->config, d->trigger_word));
+}
+
+static void ask_metrics(struct daemon *d, uint64_t token, const struct json *request)
+{
+    struct json *o = json_new_object();
+    char *text = describe_metrics(d->rig, &d->config, &d->counters);
+    (void)request;
+    json_set_string(o, "text", text ? text : "");
+    free(text);
+    control_reply(d->control, token, o);
+}
+
+// A take's folder in the request, checked: it becomes a path.
+static bool take_named(struct daemon *d, uint64_t token, const struct json *request, char id[96])
+{
+    const char *text = "";
+    char path[700];
+    json_get_string(request, "take", &text);
+    const size_t n = strlen(text);
+    if (n && n < 96 && strspn(text, "abcdefghijklmnopqrstuvwxyzABCDEFGHIJKLMNOPQRSTUVWXYZ0123456789-_") == n) {
+        take_dir(d, text, path, sizeof(path));
+        if (!access(path, F_OK)) {
+            memcpy(id, text, n + 1);
+            return true;
+        }
+    }
+    control_refuse(d->control, token, "no_such_take", "no take of that name; rigctl takes lists them");
+    return false;
+}
+
+static void ask_resume(struct daemon *d, uint64_t token, const struct json *request)
+{
+    char id[96];
+    if (!take_named(d, token, request, id))
+        return;
+    if (d->n_unfinished || rig_is_busy(d->rig))
+        control_refuse(d->control, token, "busy", "a take is under way; wait for it");
+    else if (add_unfinished(d, id))
+        d->resume_token = token;
+    else
+        control_refuse(d->control, token, "refused", "out of memory");
+}
+
+// What only reads the disk is done by its thread, the answer is ready-made.
+static void work_takes(struct job *j)
+{
+    struct json *list = describe_takes(j->dir), *o = json_new_object();
+    json_set(o, "takes", list ? list : json_new_array());
+    j->text = json_text(o);
+    json_free(o);
+}
+
+static void work_report(struct job *j)
+{
+    char path[700];
+    snprintf(path, sizeof(path), "%s/%s", j->dir, j->id);
+    j->err = ledger_read(&j->ledger, path);
+    if (j->err)
+        return;
+    struct json *o = describe_take(&j->ledger, true);
+    json_set_string(o, "path", path);
+    j->text = json_text(o);
+    json_free(o);
+}
+
+static void work_export(struct job *j)
+{
+    struct manifest_findings found;
+    char path[700];
+    snprintf(path, sizeof(path), "%s/%s", j->dir, j->id);
+    j->err = manifest_write(path, NULL, 0, j->value);
+    const int verified = j->err ? 0 : manifest_verify(path, &found);
+    struct json *o = json_new_object();
+    json_set_string(o, "path", path);
+    json_set_bool(o, "intact", !j->err && !verified);
+    json_set_int(o, "n_files", j->err ? 0 : found.n_files);
+    if (j->err == -EBADMSG)
+        j->err = 0; // written, with "failed" where something differs: that is an answer
+    j->text = json_text(o);
+    json_free(o);
+}
+
+static void done_answer(struct daemon *d, struct job *j)
+{
+    struct json *o = NULL;
+    if (j->err || !j->text || json_parse(&o, j->text, strlen(j->text), NULL))
+        control_refuse(d->control, j->token, "failed", j->err ? strerror(-j->err) : "out of memory");
+    else
+        control_reply(d->control, j->token, o);
+}
+
+static struct job *answer_job(struct daemon *d, uint64_t token, void (*work)(struct job *))
+{
+    struct job *j = new_job(work, done_answer);
+    j->token = token;
+    j->value = utc_ms() / 1000;
+    snprintf(j->dir, sizeof(j->dir), "%s", d->takes_dir);
+    return j;
+}
+
+static void ask_takes(struct daemon *d, uint64_t token, const struct json *request)
+{
+    (void)request;
+    give(d, answer_job(d, token, work_takes));
+}
+
+static void ask_take(struct daemon *d, uint64_t token, const struct json *request, void (*work)(struct job *))
+{
+    char id[96];
+    if (!take_named(d, token, request, id))
+        return;
+    struct job *j = answer_job(d, token, work);
+    memcpy(j->id, id, sizeof(id));
+    give(d, j);
+}
+
+static void ask_report(struct daemon *d, uint64_t token, const struct json *request)
+{
+    ask_take(d, token, request, work_report);
+}
+
+static void ask_export(struct daemon *d, uint64_t token, const struct json *request)
+{
+    char id[96];
+    if (!take_named(d, token, request, id))
+        return;
+    if (rig_is_busy(d->rig) && !strcmp(rig_ledger(d->rig) ? rig_ledger(d->rig)->id : "", id))
+        control_refuse(d->control, token, "busy", "this take is under way; wait for it");
+    else
+        ask_take(d, token, request, work_export);
+}
+
+static void ask_doctor(struct daemon *d, uint64_t token, const struct json *request)
+{
+    (void)request;
+    control_reply(d->control, token, doctor_examine(&d->config, "", d->takes_dir));
+}
+
+static void on_request(void *arg, uint64_t token, const char *what, const struct json *request)
+{
+    static const struct {
+        const char *what;
+        void (*ask)(struct daemon *d, uint64_t token, const struct json *request);
+    } requests[] = {
+        { "status", ask_status }, { "capture", ask_capture }, { "preflight", ask_preflight }, { "calibrate", ask_calibrate }, { "identify", ask_identify },
+        { "reinstate", ask_reinstate }, { "cancel", ask_cancel }, { "takes", ask_takes }, { "report", ask_report }, { "resume", ask_resume }, { "export", ask_export },
+        { "doctor", ask_doctor }, { "metrics", ask_metrics },
+    };
+    for (size_t i = 0; i < sizeof(requests) / sizeof(requests[0]); i++)
+        if (!strcmp(what, requests[i].what)) {
+            requests[i].ask(arg, token, request);
+            return;
+        }
+    struct daemon *d = arg;
+    control_refuse(d->control, token, "unknown", "expected status, capture, preflight, calibrate, identify, reinstate, cancel, takes, report, resume, export, doctor, metrics or subscribe");
+}
+
+static int on_control(sd_event_source *source, int fd, uint32_t events, void *arg)
+{
+    struct daemon *d = arg;
+    (void)source, (void)fd, (void)events;
+    control_dispatch(d->control);
+    return 0;
+}
+
+// ---- the rig's actions ----------------------------------------------------------------------------------------------------------------------
+
+static void preflight_is_done(struct daemon *d)
+{
+    control_reply(d->control, d->preflight_token, describe_findings(d->rig, &d->config));
+    d->preflight_token = 0;
+}
+
+static void obey(struct daemon *d, const struct rig_action *a)
+{
+    const struct ledger *l = rig_ledger(d->rig);
+    struct job *j;
+    switch (a->kind) {
+    case RIG_SPAWN:
+        start_worker(d, a->camera);
+        return;
+    case RIG_KILL:
+        if (d->worker[a->camera].pid > 0)
+            kill(d->worker[a->camera].pid, SIGKILL);
+        return;
+    case RIG_SEND:
+        send_command(d, a->camera, &a->command);
+        return;
+    case RIG_POWER:
+        switch_power(d, a->camera, a->on);
+        return;
+    case RIG_RELAY:
+        if (!d->trigger || trigger_relay(d->trigger, a->camera, !a->on))
+            log_warning("rigd: camera %s: its relay could not be switched", d->config.camera[a->camera].name);
+        return;
+    case RIG_SPACE:
+        j = new_job(work_space, done_space);
+        snprintf(j->dir, sizeof(j->dir), "%s", d->takes_dir);
+        give(d, j);
+        return;
+    case RIG_CREATE:
+        j = new_job(work_create, done_commit);
+        j->text = ledger_text(l);
+        snprintf(j->dir, sizeof(j->dir), "%s", d->takes_dir);
+        snprintf(j->id, sizeof(j->id), "%s", l->id);
+        give(d, j);
+        return;
+    case RIG_COMMIT:
+        j = new_job(work_commit, done_commit);
+        j->text = ledger_text(l);
+        take_dir(d, l->id, j->dir, sizeof(j->dir));
+        give(d, j);
+        return;
+    case RIG_FIRE:
+        fire(d, &a->shot);
+        return;
+    case RIG_RELEASE:
+        if (d->trigger)
+            trigger_release(d->trigger);
+        return;
+    case RIG_MANIFEST:
+        j = new_job(work_manifest, done_manifest);
+        know_copies(j, l);
+        j->value = utc_ms() / 1000;
+        take_dir(d, l->id, j->dir, sizeof(j->dir));
+        give(d, j);
+        return;
+    case RIG_STATE: {
+        struct json *o = json_new_object();
+        json_set_string(o, "state", take_state_name(l->state));
+        json_set_string(o, "take", l->id);
+        control_publish(d->control, "state", o);
+        return;
+    }
+    case RIG_SAY:
+        tell(d, a);
+        return;
+    case RIG_PREFLIGHT_DONE:
+        preflight_is_done(d);
+        return;
+    case RIG_TAKE_DONE:
+        take_is_done(d);
+        return;
+    case RIG_LAG_DONE:
+        keep_lag(d);
+        return;
+    case RIG_IDENTIFIED:
+        if (a->text[0])
+            control_refuse(d->control, d->identify_token[a->camera], "failed", a->text);
+        else
+            control_reply(d->control, d->identify_token[a->camera], json_new_object());
+        d->identify_token[a->camera] = 0;
+        return;
+    }
+}
+
+// After each event: what the rig wants now, and when it wants to be woken.
+static int look_at_rig(sd_event_source *source, void *arg)
+{
+    static struct rig_action a;
+    struct daemon *d = arg;
+    (void)source;
+    for (bool more = true; more;) {
+        more = false;
+        while (rig_next(d->rig, &a)) {
+            obey(d, &a);
+            more = true;
+        }
+        look_for_work(d);
+    }
+    const int64_t due = rig_deadline_ns(d->rig);
+    sd_event_source_set_time(d->timer, due == INT64_MAX ? UINT64_MAX : (uint64_t)(due / 1000 + 1));
+    sd_event_source_set_enabled(d->timer, due == INT64_MAX ? SD_EVENT_OFF : SD_EVENT_ONESHOT);
+    return 0;
+}
+
+static int on_time(sd_event_source *source, uint64_t usec, void *arg)
+{
+    struct daemon *d = arg;
+    (void)source, (void)usec;
+    rig_time(d->rig, now_ns());
+    return 0;
+}
+
+static int on_signal(sd_event_source *source, const struct signalfd_siginfo *si, void *arg)
+{
+    struct daemon *d = arg;
+    (void)source;
+    log_info("rigd: %s: ending; a take under way is resumed at the next start", strsignal((int)si->ssi_signo));
+    d->stopping = true;
+    rig_stop(d->rig, now_ns());
+    look_at_rig(NULL, d);
+    sd_event_exit(d->event, 0);
+    return 0;
+}
+
+// ---- life ---------------------------------------------------------------------------------------------------------------------------------------
+
+static int find_worker_program(struct daemon *d)
+{
+    const char *named = getenv("RIGD_CAMERA");
+    const ssize_t n = named ? (ssize_t)strlen(named) : readlink("/proc/self/exe", d->worker_path, sizeof(d->worker_path) - 20);
+    if (named && n < (ssize_t)sizeof(d->worker_path)) {
+        strcpy(d->worker_path, named);
+    } else if (n > 0) {
+        d->worker_path[n] = 0;
+        strcpy(strrchr(d->worker_path, '/') + 1, "rigd-camera");
+    }
+    if (!access(d->worker_path, X_OK))
+        return 0;
+    const int err = -errno;
+    log_error("rigd: cannot run %s: %s; install it beside rigd, or name it in RIGD_CAMERA", d->worker_path, strerror(-err));
+    return err;
+}
+
+static int set_up_loop(struct daemon *d)
+{
+    sigset_t set;
+    sd_event_source *post = NULL;
+    sigemptyset(&set);
+    sigaddset(&set, SIGTERM);
+    sigaddset(&set, SIGINT);
+    sigaddset(&set, SIGCHLD);
+    sigprocmask(SIG_BLOCK, &set, NULL);
+    int err = sd_event_default(&d->event);
+    if (err >= 0)
+        err = sd_event_add_signal(d->event, NULL, SIGTERM, on_signal, d);
+    if (err >= 0)
+        err = sd_event_add_signal(d->event, NULL, SIGINT, on_signal, d);
+    if (err >= 0)
+        err = sd_event_add_time(d->event, &d->timer, CLOCK_MONOTONIC, 0, 1, on_time, d);
+    if (err >= 0)
+        err = sd_event_add_time_relative(d->event, &d->trigger_timer, CLOCK_MONOTONIC, 0, 1, open_the_trigger, d);
+    if (err >= 0)
+        err = sd_event_add_io(d->event, NULL, control_fd(d->control), EPOLLIN, on_control, d);
+    if (err >= 0)
+        err = sd_event_add_io(d->event, NULL, d->finished_fd, EPOLLIN, on_finished, d);
+    if (err >= 0)
+        err = sd_event_add_post(d->event, &post, look_at_rig, d);
+    if (post) {
+        sd_event_source_set_enabled(post, SD_EVENT_ON);
+        sd_event_source_set_floating(post, true);
+        sd_event_source_unref(post);
+    }
+    if (err >= 0)
+        err = sd_event_set_watchdog(d->event, true);
+    if (err < 0)
+        log_error("rigd: cannot set up the event loop: %s", strerror(-err));
+    return err < 0 ? err : 0;
+}
+
+// End of file lets a worker close its camera; one whose driver hangs does not hear and is killed. What it copies is not named yet.
+static void end_workers(struct daemon *d)
+{
+    pid_t pid[CONFIG_CAMERAS_MAX];
+    int n_left = 0;
+    for (int i = 0; d->worker && i < d->config.n_cameras; i++) {
+        pid[i] = d->worker[i].pid;
+        n_left += pid[i] > 0;
+        forget_worker(&d->worker[i]);
+    }
+    for (int turn = 0; n_left && turn < 2 * WORKERS_END_MS / 10; turn++) {
+        for (int i = 0; i < d->config.n_cameras; i++) {
+            if (pid[i] > 0 && turn == WORKERS_END_MS / 10)
+                kill(pid[i], SIGKILL);
+            if (pid[i] > 0 && waitpid(pid[i], NULL, WNOHANG) == pid[i]) {
+                pid[i] = 0;
+                n_left--;
+            }
+        }
+        if (n_left)
+            usleep(10000);
+    }
+}
+
+static void tear_down(struct daemon *d)
+{
+    end_workers(d);
+    sd_event_source_disable_unref(d->trigger_io);
+    trigger_close(d->trigger);
+    if (d->disk_runs) {
+        pthread_mutex_lock(&d->lock);
+        d->disk_ends = true; // after what it has to do
+        pthread_cond_signal(&d->wake);
+        pthread_mutex_unlock(&d->lock);
+        pthread_join(d->disk, NULL);
+    }
+    for (struct job *j = d->finished; j;) {
+        struct job *next = j->next;
+        job_free(j);
+        j = next;
+    }
+    control_close(d->control);
+    sd_event_source_disable_unref(d->timer);
+    sd_event_source_disable_unref(d->trigger_timer);
+    sd_event_unref(d->event);
+    if (d->finished_fd >= 0)
+        close(d->finished_fd);
+    rig_free(d->rig);
+    config_free(&d->config);
+    free(d->worker);
+    free(d->unfinished);
+    if (d->to_journal)
+        log_set_hook(NULL, NULL);
+    free(d);
+}
+
+static int run(struct daemon *d)
+{
+    struct rlimit files;
+    struct lag lag[CONFIG_CAMERAS_MAX];
+    char path[400];
+    if (!getrlimit(RLIMIT_NOFILE, &files)) { // a worker's socket and pidfd each; workers stay below 1024 themselves
+        files.rlim_cur = files.rlim_max < 8192 ? files.rlim_max : 8192;
+        setrlimit(RLIMIT_NOFILE, &files);
+    }
+    int err = rig_create(&d->rig, &d->config);
+    if (err)
+        return err;
+    lag_path(d, path, sizeof(path));
+    if (!lag_read(path, &d->config, lag))
+        rig_set_lag(d->rig, lag);
+    d->worker = calloc((size_t)d->config.n_cameras, sizeof(*d->worker));
+    d->finished_fd = eventfd(0, EFD_CLOEXEC | EFD_NONBLOCK);
+    if (!d->worker || d->finished_fd < 0)
+        return -ENOMEM;
+    for (int i = 0; i < d->config.n_cameras; i++)
+        d->worker[i] = (struct worker){ .daemon = d, .camera = i, .fd = -1 };
+    err = find_worker_program(d);
+    if (!err)
+        err = make_directories(d->takes_dir);
+    if (!err)
+        err = control_open(&d->control, d->config.socket_path, on_request, d);
+    if (!err)
+        err = set_up_loop(d);
+    if (!err)
+        err = -pthread_create(&d->disk, NULL, disk_thread, d);
+    if (err)
+        return err;
+    d->disk_runs = true;
+    find_unfinished(d);
+    rig_start(d->rig, now_ns());
+    sd_notifyf(0, "READY=1\nSTATUS=%d cameras", d->config.n_cameras);
+    look_at_rig(NULL, d);
+    err = sd_event_loop(d->event);
+    sd_notify(0, "STOPPING=1");
+    return err < 0 ? err : d->exit_code;
+}
+
+int daemon_run(const struct daemon_options *options)
+{
+    struct daemon *d = calloc(1, sizeof(*d));
+    if (!d)
+        return -ENOMEM;
+    pthread_mutex_init(&d->lock, NULL);
+    pthread_cond_init(&d->wake, NULL);
+    d->finished_fd = -1;
+    d->trigger_word = "not open yet";
+    d->once = options->once;
+    d->to_journal = getenv("JOURNAL_STREAM") != NULL;
+    if (d->to_journal) {
+        log_set_level(LOG_SILENT);
+        log_set_hook(to_journal, NULL);
+    }
+    int err = config_read(&d->config, options->config_path);
+    if (!err && options->takes_dir) {
+        char *whole = make_directories(options->takes_dir) ? NULL : realpath(options->takes_dir, NULL);
+        if (!whole || strlen(whole) >= sizeof(d->config.takes_dir)) {
+            log_error("rigd: --takes %s: expected a folder whose path has less than %zu bytes", options->takes_dir, sizeof(d->config.takes_dir));
+            err = -EINVAL;
+        } else {
+            strcpy(d->config.takes_dir, whole);
+        }
+        free(whole);
+    }
+    if (!err && options->socket_path) {
+        if (strlen(options->socket_path) >= sizeof(d->config.socket_path)) {
+            log_error("rigd: --socket %s: longer than %zu bytes", options->socket_path, sizeof(d->config.socket_path) - 1);
+            err = -EINVAL;
+        } else {
+            strcpy(d->config.socket_path, options->socket_path);
+        }
+    }
+    if (!err) {
+        strcpy(d->takes_dir, d->config.takes_dir);
+        err = run(d);
+    }
+    tear_down(d);
+    return err;
+}

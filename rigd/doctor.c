@@ -1,0 +1,223 @@
+// rigd/doctor.c - looks at /sys and /proc, touches no camera.
+//
+// Figures from RIG.md 1: a PTP camera takes 4 endpoints of the 96 that common controllers have; usbfs gives 16 MB to all devices
+// together unless told otherwise, and libgphoto2 reads 512 KiB blocks.
+#include "rigd/doctor.h"
+
+#include <dirent.h>
+#include <errno.h>
+#include <fcntl.h>
+#include <stdarg.h>
+#include <stdio.h>
+#include <stdlib.h>
+#include <string.h>
+#include <sys/stat.h>
+#include <sys/statvfs.h>
+#include <sys/timex.h>
+#include <unistd.h>
+
+enum { ENDPOINTS_PER_CAMERA = 4, ENDPOINTS_PER_CONTROLLER = 96, BLOCK_KB = 512 };
+
+struct examination {
+    const struct config *config;
+    const char *root;
+    struct json *list;
+    bool healthy;
+};
+
+__attribute__((format(printf, 4, 5))) static void find(struct examination *x, const char *severity, const char *about, const char *format, ...)
+{
+    char text[500];
+    va_list args;
+    va_start(args, format);
+    vsnprintf(text, sizeof(text), format, args);
+    va_end(args);
+    struct json *o = json_new_object();
+    json_set_string(o, "severity", severity);
+    json_set_string(o, "about", about);
+    json_set_string(o, "text", text);
+    json_append(x->list, o);
+    if (!strcmp(severity, "error"))
+        x->healthy = false;
+}
+
+// First line of root/path. False: not there.
+static bool read_line(const struct examination *x, const char *path, char *out, size_t room)
+{
+    char full[600];
+    snprintf(full, sizeof(full), "%s%s", x->root, path);
+    FILE *f = fopen(full, "re");
+    const bool got = f && fgets(out, (int)room, f);
+    if (f)
+        fclose(f);
+    if (got)
+        out[strcspn(out, "\n")] = 0;
+    return got;
+}
+
+static int read_number(const struct examination *x, const char *path, int missing)
+{
+    char text[40];
+    return read_line(x, path, text, sizeof(text)) ? atoi(text) : missing;
+}
+
+static void check_endpoints(struct examination *x)
+{
+    int n[256] = { 0 };
+    for (int i = 0; i < x->config->n_cameras; i++)
+        n[x->config->camera[i].controller]++;
+    for (int c = 1; c < 256; c++) {
+        const int endpoints = n[c] * ENDPOINTS_PER_CAMERA;
+        if (endpoints > ENDPOINTS_PER_CONTROLLER)
+            find(x, "error", "endpoints", "USB bus %d: %d cameras take %d endpoints, common controllers have %d (about %d cameras): move %d cameras to another controller card", c, n[c],
+                 endpoints, ENDPOINTS_PER_CONTROLLER, ENDPOINTS_PER_CONTROLLER / ENDPOINTS_PER_CAMERA, n[c] - ENDPOINTS_PER_CONTROLLER / ENDPOINTS_PER_CAMERA);
+        else if (n[c])
+            find(x, "info", "endpoints", "USB bus %d: %d cameras, %d of about %d endpoints", c, n[c], endpoints, ENDPOINTS_PER_CONTROLLER);
+    }
+}
+
+static void check_usbfs(struct examination *x)
+{
+    bool on[256] = { false };
+    int n_usb = 0, n_controllers = 0;
+    for (int i = 0; i < x->config->n_cameras; i++)
+        if (x->config->camera[i].controller) {
+            n_usb++;
+            n_controllers += !on[x->config->camera[i].controller];
+            on[x->config->camera[i].controller] = true;
+        }
+    if (!n_usb)
+        return;
+    const int parallel = x->config->fetch_limit * n_controllers < n_usb ? x->config->fetch_limit * n_controllers : n_usb;
+    const int needed_mb = (parallel * BLOCK_KB + 1023) / 1024 + n_usb * 16 / 1024 + 1;
+    const int have_mb = read_number(x, "/sys/module/usbcore/parameters/usbfs_memory_mb", -1);
+    if (have_mb < 0)
+        find(x, "warning", "usbfs", "cannot read usbfs_memory_mb; %d MB are needed for %d parallel copies", needed_mb, parallel);
+    else if (have_mb && have_mb < needed_mb)
+        find(x, "error", "usbfs", "usbfs_memory_mb is %d, %d parallel copies need %d: echo %d > /sys/module/usbcore/parameters/usbfs_memory_mb, and usbcore.usbfs_memory_mb=%d on the kernel's command line", have_mb,
+             parallel, needed_mb, 4 * needed_mb, 4 * needed_mb);
+    else
+        find(x, "info", "usbfs", "usbfs_memory_mb %d, %d needed", have_mb, needed_mb);
+}
+
+// Which process has root/dev/... open? 0: none (or none that we may look at).
+static int holder_of(const struct examination *x, const char *device, char *name, size_t room)
+{
+    char proc[600];
+    snprintf(proc, sizeof(proc), "%s/proc", x->root);
+    DIR *d = opendir(proc);
+    int found = 0;
+    for (const struct dirent *e; d && !found && (e = readdir(d));) {
+        char fds[900];
+        const int pid = atoi(e->d_name);
+        if (pid <= 0)
+            continue;
+        snprintf(fds, sizeof(fds), "%s/%d/fd", proc, pid);
+        DIR *f = opendir(fds);
+        for (const struct dirent *g; f && !found && (g = readdir(f));) {
+            char target[300];
+            const ssize_t n = readlinkat(dirfd(f), g->d_name, target, sizeof(target) - 1);
+            if (n < 0)
+                continue;
+            target[n] = 0;
+            if (!strcmp(target, device))
+                found = pid;
+        }
+        if (f)
+            closedir(f);
+    }
+    if (d)
+        closedir(d);
+    char comm[60];
+    snprintf(comm, sizeof(comm), "/proc/%d/comm", found);
+    if (!found || !read_line(x, comm, name, room))
+        snprintf(name, room, "?");
+    return found;
+}
+
+static void check_ports(struct examination *x)
+{
+    for (int i = 0; i < x->config->n_cameras; i++) {
+        const struct config_camera *c = &x->config->camera[i];
+        char about[40], path[200], device[60], full[700], serial[80], name[60];
+        if (strncmp(c->port, "usb:", 4))
+            continue;
+        snprintf(about, sizeof(about), "camera %s", c->name);
+        snprintf(path, sizeof(path), "/sys/bus/usb/devices/%.80s/busnum", c->port + 4);
+        const int bus = read_number(x, path, -1);
+        snprintf(path, sizeof(path), "/sys/bus/usb/devices/%.80s/devnum", c->port + 4);
+        const int number = read_number(x, path, -1);
+        if (bus < 0 || number < 0) {
+            find(x, "error", about, "nothing is plugged into its port %s: check cable, hub and power", c->port);
+            continue;
+        }
+        snprintf(path, sizeof(path), "/sys/bus/usb/devices/%.80s/serial", c->port + 4);
+        if (c->serial[0] && read_line(x, path, serial, sizeof(serial))) {
+            const size_t n = strlen(serial), m = strlen(c->serial); // USB pads with zeros
+            if (m > n ? strcmp(c->serial, serial) : strcmp(serial + n - m, c->serial))
+                find(x, "error", about, "in its port %s hangs serial %s, rigd.conf says %s: plug the right body, or correct rigd.conf", c->port, serial, c->serial);
+        }
+        snprintf(device, sizeof(device), "/dev/bus/usb/%03d/%03d", bus, number);
+        snprintf(full, sizeof(full), "%s%s", x->root, device);
+        if (access(full, R_OK | W_OK))
+            find(x, "error", about, "%s: %s: install rigd's udev rules, and let rigd's user be in group plugdev", device, strerror(errno));
+        const int pid = holder_of(x, device, name, sizeof(name));
+        if (pid && strncmp(name, "rigd", 4))
+            find(x, "error", about, "%s is held by %s (process %d): stop it; rigd's udev rules keep the desktop away", device, name, pid);
+    }
+}
+
+static void check_clock(struct examination *x)
+{
+    struct timex t = { 0 };
+    if (x->root[0])
+        return;
+    if (adjtimex(&t) == TIME_ERROR || (t.status & STA_UNSYNC))
+        find(x, "warning", "clock", "this machine's clock is not synchronised: install chrony or systemd-timesyncd; takes are named by UTC");
+    else
+        find(x, "info", "clock", "synchronised");
+}
+
+static void check_disk(struct examination *x, const char *takes_dir)
+{
+    struct statvfs s;
+    const struct config *c = x->config;
+    const int64_t take_mb = (int64_t)c->raw_mb * c->objects_per_shot * c->n_cameras;
+    if (statvfs(takes_dir, &s)) {
+        find(x, "error", "disk", "%.200s: %s: create it, and let rigd's user own it", takes_dir, strerror(errno));
+        return;
+    }
+    const int64_t free_mb = (int64_t)((double)s.f_bavail * (double)s.f_frsize / 1048576);
+    const int64_t n_takes = take_mb ? (free_mb - (int64_t)c->free_space_mb) / take_mb : 0;
+    if (access(takes_dir, W_OK))
+        find(x, "error", "disk", "%.200s: %s: let rigd's user own it", takes_dir, strerror(errno));
+    else if (free_mb < take_mb + (int64_t)c->free_space_mb)
+        find(x, "error", "disk", "%.200s: %lld MB free, a take needs %lld and %u stay free: remove old takes", takes_dir, (long long)free_mb, (long long)take_mb, c->free_space_mb);
+    else
+        find(x, n_takes < 10 ? "warning" : "info", "disk", "%.200s: room for %lld takes of at most %lld MB", takes_dir, (long long)n_takes, (long long)take_mb);
+    if (s.f_favail && s.f_favail < 10000)
+        find(x, "warning", "disk", "%.200s: only %llu inodes free", takes_dir, (unsigned long long)s.f_favail);
+}
+
+static void check_descriptors(struct examination *x)
+{
+    const long most = sysconf(_SC_OPEN_MAX);
+    const long needed = 4L * x->config->n_cameras + 100;
+    if (!x->root[0] && most >= 0 && most < needed)
+        find(x, "error", "descriptors", "at most %ld open files, %ld needed: LimitNOFILE=%ld in the unit", most, needed, 4 * needed);
+}
+
+struct json *doctor_examine(const struct config *config, const char *root, const char *takes_dir)
+{
+    struct examination x = { .config = config, .root = root, .list = json_new_array(), .healthy = true };
+    check_endpoints(&x);
+    check_usbfs(&x);
+    check_ports(&x);
+    check_clock(&x);
+    check_disk(&x, takes_dir);
+    check_descriptors(&x);
+    struct json *o = json_new_object();
+    json_set_bool(o, "healthy", x.healthy);
+    json_set(o, "findings", x.list);
+    return o;
+}

@@ -1,0 +1,582 @@
+// rigd/rigctl.c - the daemon's command line client: one request, one answer, as a table or as JSON.
+//
+// CONTROL.md is the protocol. While a take runs, events of the stream are printed on a terminal, so that people see what happens.
+#include "solver/take/json.h"
+#include "solver/take/log.h"
+
+#include <argp.h>
+#include <errno.h>
+#include <math.h>
+#include <stdarg.h>
+#include <stdio.h>
+#include <stdlib.h>
+#include <string.h>
+#include <sys/socket.h>
+#include <sys/un.h>
+#include <unistd.h>
+
+enum { EXIT_DONE = 0, EXIT_FAILED = 1, EXIT_USAGE = 2, LINE_MAX_BYTES = 64 << 20 };
+
+struct arguments {
+    const char *socket_path, *name, *word[3];
+    int n_words, shots;
+    bool json, watch, without_missing;
+};
+
+struct line_reader {
+    int fd;
+    char *bytes;
+    size_t n, room;
+};
+
+// ---- the wire --------------------------------------------------------------------------------------------------------------------
+
+static int connect_to(const char *path)
+{
+    struct sockaddr_un address = { .sun_family = AF_UNIX };
+    if (strlen(path) >= sizeof(address.sun_path)) {
+        log_error("rigctl: --socket %s: longer than %zu bytes", path, sizeof(address.sun_path) - 1);
+        return -1;
+    }
+    strcpy(address.sun_path, path);
+    const int fd = socket(AF_UNIX, SOCK_STREAM | SOCK_CLOEXEC, 0);
+    if (fd < 0 || connect(fd, (struct sockaddr *)&address, sizeof(address))) {
+        log_error("rigctl: cannot reach rigd at %s: %s; %s", path, strerror(errno),
+                  errno == EACCES ? "become a member of rigd's group" : "is it running (systemctl status rigd)? --socket or RIGD_SOCKET names another");
+        if (fd >= 0)
+            close(fd);
+        return -1;
+    }
+    return fd;
+}
+
+// The next line as JSON; NULL: the daemon has left.
+static struct json *next_message(struct line_reader *r)
+{
+    for (;;) {
+        char *newline = r->n ? memchr(r->bytes, '\n', r->n) : NULL;
+        if (newline) {
+            struct json *doc = NULL;
+            const size_t n = (size_t)(newline - r->bytes);
+            const int err = json_parse(&doc, r->bytes, n, "rigd's answer");
+            r->n -= n + 1;
+            memmove(r->bytes, newline + 1, r->n);
+            return err ? NULL : doc;
+        }
+        if (r->n == r->room) {
+            r->room = r->room ? 2 * r->room : 65536;
+            char *grown = r->room <= LINE_MAX_BYTES ? realloc(r->bytes, r->room) : NULL;
+            if (!grown)
+                return NULL;
+            r->bytes = grown;
+        }
+        const ssize_t n = read(r->fd, r->bytes + r->n, r->room - r->n);
+        if (n < 0 && errno == EINTR)
+            continue;
+        if (n <= 0) {
+            log_error("rigctl: rigd ended the conversation; journalctl -u rigd says why");
+            return NULL;
+        }
+        r->n += (size_t)n;
+    }
+}
+
+static bool send_request(int fd, struct json *request) // takes request
+{
+    char *text = json_text(request);
+    json_free(request);
+    if (!text)
+        return false;
+    const bool sent = dprintf(fd, "%s\n", text) > 0;
+    free(text);
+    return sent;
+}
+
+static struct json *request_of(const char *what)
+{
+    struct json *o = json_new_object();
+    json_set_int(o, "v", 1);
+    json_set_int(o, "id", 1);
+    json_set_string(o, "do", what);
+    return o;
+}
+
+static const char *text_of(const struct json *v, const char *path)
+{
+    const char *s = "";
+    json_get_string(v, path, &s);
+    return s;
+}
+
+static double number_of(const struct json *v, const char *path, double missing)
+{
+    double n = missing;
+    json_get_number(v, path, &n);
+    return n;
+}
+
+static bool flag_of(const struct json *v, const char *path)
+{
+    bool b = false;
+    json_get_bool(v, path, &b);
+    return b;
+}
+
+static void print_event(const struct json *message)
+{
+    const char *event = text_of(message, "event");
+    if (!strcmp(event, "state"))
+        fprintf(stderr, "  %s\n", text_of(message, "body.state"));
+    else if (!strcmp(event, "say"))
+        fprintf(stderr, "  %s: %s\n", text_of(message, "body.severity"), text_of(message, "body.text"));
+}
+
+// Ask and wait for the answer. events: show what happens meanwhile. NULL: said why.
+static struct json *ask(const struct arguments *a, struct json *request, bool events)
+{
+    struct line_reader r = { .fd = connect_to(a->socket_path) };
+    struct json *answer = NULL;
+    if (r.fd < 0) {
+        json_free(request);
+        return NULL;
+    }
+    if (events) {
+        struct json *subscribe = request_of("subscribe");
+        json_set_int(subscribe, "id", 0);
+        send_request(r.fd, subscribe);
+    }
+    send_request(r.fd, request);
+    for (struct json *m; !answer && (m = next_message(&r));) {
+        int64_t id = -1;
+        if (json_get(m, "event"))
+            print_event(m);
+        else if (!json_get_int(m, "id", &id) && id == 1)
+            answer = m;
+        else if (json_get(m, "error"))
+            answer = m;
+        if (answer != m)
+            json_free(m);
+    }
+    close(r.fd);
+    free(r.bytes);
+    if (answer && !flag_of(answer, "ok")) {
+        log_error("rigctl: %s", text_of(answer, "error.text"));
+        if (a->json)
+            puts(json_text(answer));
+        json_free(answer);
+        return NULL;
+    }
+    return answer;
+}
+
+// ---- what people see ---------------------------------------------------------------------------------------------------------------
+
+static const struct json *element(const struct json *v, const char *list, int i)
+{
+    char key[60];
+    snprintf(key, sizeof(key), "%s.%d", list, i);
+    return json_get(v, key);
+}
+
+static void print_number(const char *format, double n, const char *unknown)
+{
+    if (isnan(n))
+        fputs(unknown, stdout);
+    else
+        printf(format, n);
+}
+
+static void print_take(const struct json *t)
+{
+    printf("take %s: %s", text_of(t, "id"), text_of(t, "state"));
+    if (json_get(t, "seconds"))
+        printf(" after %.2f s", number_of(t, "seconds", 0));
+    printf("\n  %.0f of %.0f cameras, %.0f frames, %.1f MB", number_of(t, "n_delivered", 0), number_of(t, "n_expected", 0), number_of(t, "n_frames", 0),
+           1e-6 * number_of(t, "bytes", 0));
+    if (json_get(t, "seconds") && number_of(t, "seconds", 0) > 0)
+        printf(", %.1f MB/s", 1e-6 * number_of(t, "bytes", 0) / number_of(t, "seconds", 1));
+    putchar('\n');
+    if (json_get(t, "spread_ms"))
+        printf("  shutters: spread %.3f ms, sigma %.3f ms over %.0f bodies%s\n", number_of(t, "spread_ms", 0), number_of(t, "sigma_ms", 0), number_of(t, "n_measured", 0),
+               flag_of(t, "synchronised") ? "" : " (pressed by drivers: not synchronised)");
+    if (text_of(t, "reason")[0])
+        printf("  reason: %s\n", text_of(t, "reason"));
+    static const char *const lists[][2] = { { "missing", "missing" }, { "left_out", "left out" } };
+    for (int k = 0; k < 2; k++)
+        for (int i = 0; i < json_length(t, lists[k][0]); i++) {
+            const struct json *c = element(t, lists[k][0], i);
+            printf("  %s: %s (%s): %s\n", lists[k][1], text_of(c, "camera"), text_of(c, "port"), text_of(c, "note"));
+        }
+}
+
+static void print_status(const struct json *s)
+{
+    printf("%s: %s, %.0f of %.0f cameras ready, %.0f quarantined; trigger %s\n", text_of(s, "name"), text_of(s, "state"), number_of(s, "n_ready", 0),
+           number_of(s, "n_cameras", 0), number_of(s, "n_quarantined", 0), text_of(s, "trigger"));
+    if (text_of(s, "outcome")[0])
+        printf("last: %s\n", text_of(s, "outcome"));
+    printf("%-10s %-12s %-11s %-12s %-20s %5s %6s %8s  %s\n", "camera", "condition", "doing", "serial", "model", "batt", "free", "lag ms", "note");
+    for (int i = 0; i < json_length(s, "cameras"); i++) {
+        const struct json *c = element(s, "cameras", i);
+        printf("%-10s %-12s %-11s %-12.12s %-20.20s ", text_of(c, "name"), text_of(c, "condition"), text_of(c, "doing"), text_of(c, "serial"), text_of(c, "model"));
+        print_number("%4.0f%% ", number_of(c, "battery_percent", NAN), "    - ");
+        print_number("%6.0f ", number_of(c, "free_images", NAN), "     - ");
+        print_number("%8.2f", number_of(c, "lag_ms", NAN), "       -");
+        printf("  %s\n", text_of(c, "note"));
+    }
+}
+
+static void print_findings(const struct json *f)
+{
+    for (int i = 0; i < json_length(f, "findings"); i++) {
+        const struct json *e = element(f, "findings", i);
+        const char *about = json_get(e, "about") ? text_of(e, "about") : text_of(e, "camera");
+        printf("%-8s %s%s%s%s%s%s\n", text_of(e, "severity"), about, text_of(e, "port")[0] ? " (" : "", text_of(e, "port"), text_of(e, "port")[0] ? ")" : "", about[0] ? ": " : "",
+               text_of(e, "text"));
+    }
+}
+
+static void print_lag(const struct json *l)
+{
+    printf("%-10s %9s %8s %9s %5s %8s\n", "camera", "mean ms", "std ms", "+- ms", "n", "rejected");
+    for (int i = 0; i < json_length(l, "lag"); i++) {
+        const struct json *e = element(l, "lag", i);
+        if (number_of(e, "n", 0) < 1)
+            printf("%-10s not measured\n", text_of(e, "camera"));
+        else
+            printf("%-10s %9.3f %8.3f %9.3f %5.0f %8.0f%s\n", text_of(e, "camera"), number_of(e, "mean_ms", 0), number_of(e, "std_ms", 0), number_of(e, "error_ms", 0), number_of(e, "n", 0),
+                   number_of(e, "rejected", 0), flag_of(e, "steady") ? "" : "  unsteady");
+    }
+}
+
+// ---- commands ----------------------------------------------------------------------------------------------------------------------------
+
+// Ask; with --json print the result as it is, else by print. 0 and *out (if wanted), or EXIT_FAILED.
+static int ask_and_print(const struct arguments *a, struct json *request, bool events, void (*print)(const struct json *), struct json **out)
+{
+    struct json *answer = ask(a, request, events && !a->json && isatty(2));
+    if (!answer)
+        return EXIT_FAILED;
+    const struct json *result = json_get(answer, "result");
+    if (a->json) {
+        char *text = json_text(result);
+        puts(text ? text : "null");
+        free(text);
+    } else if (print) {
+        print(result);
+    }
+    if (out)
+        *out = answer;
+    else
+        json_free(answer);
+    return EXIT_DONE;
+}
+
+static int status(const struct arguments *a)
+{
+    if (!a->watch)
+        return ask_and_print(a, request_of("status"), false, print_status, NULL);
+    for (;;) { // until Ctrl-C
+        if (isatty(1) && !a->json)
+            fputs("\033[H\033[2J", stdout);
+        const int err = ask_and_print(a, request_of("status"), false, print_status, NULL);
+        if (err)
+            return err;
+        fflush(stdout);
+        usleep(200000);
+    }
+}
+
+static int healthy(const struct arguments *a, const char *what, const char *flag)
+{
+    struct json *answer = NULL;
+    const int err = ask_and_print(a, request_of(what), true, print_findings, &answer);
+    if (err)
+        return err;
+    char path[40];
+    snprintf(path, sizeof(path), "result.%s", flag);
+    const bool good = flag_of(answer, path);
+    if (!a->json && good && !json_length(answer, "result.findings"))
+        puts("nothing to complain about");
+    json_free(answer);
+    return good ? EXIT_DONE : EXIT_FAILED;
+}
+
+static int doctor(const struct arguments *a)
+{
+    return healthy(a, "doctor", "healthy");
+}
+
+static int preflight(const struct arguments *a)
+{
+    return healthy(a, "preflight", "fit");
+}
+
+static int take_result(const struct arguments *a, struct json *request)
+{
+    struct json *answer = NULL;
+    const int err = ask_and_print(a, request, true, print_take, &answer);
+    if (err)
+        return err;
+    const bool good = !strcmp(text_of(answer, "result.state"), "verified");
+    json_free(answer);
+    return good ? EXIT_DONE : EXIT_FAILED;
+}
+
+static int capture(const struct arguments *a)
+{
+    struct json *r = request_of("capture");
+    json_set_string(r, "name", a->name);
+    json_set_bool(r, "without_missing", a->without_missing);
+    return take_result(a, r);
+}
+
+static struct json *about_take(const char *what, const char *take)
+{
+    struct json *r = request_of(what);
+    json_set_string(r, "take", take);
+    return r;
+}
+
+static int resume(const struct arguments *a)
+{
+    return take_result(a, about_take("resume", a->word[1]));
+}
+
+static void print_report(const struct json *t)
+{
+    print_take(t);
+    for (int i = 0; i < json_length(t, "cameras"); i++) {
+        const struct json *c = element(t, "cameras", i);
+        printf("  %-10s %-12s", text_of(c, "camera"), text_of(c, "serial"));
+        print_number(" lag %8.3f ms", number_of(c, "lag_ms", NAN), "");
+        for (int k = 0; k < json_length(c, "files"); k++) {
+            const struct json *f = element(c, "files", k);
+            printf("  %s %.0f %s", text_of(f, "file"), number_of(f, "size", 0), text_of(f, "xxh128"));
+        }
+        printf("%s%s\n", text_of(c, "note")[0] ? "  " : "", text_of(c, "note"));
+    }
+}
+
+static int report(const struct arguments *a)
+{
+    return ask_and_print(a, about_take("report", a->word[1]), false, print_report, NULL);
+}
+
+static void print_preview(const struct json *t)
+{
+    for (int i = 0; i < json_length(t, "cameras"); i++) {
+        char path[1024];
+        const struct json *c = element(t, "cameras", i);
+        snprintf(path, sizeof(path), "%s/thumbnails/%s.jpg", text_of(t, "path"), text_of(c, "camera"));
+        printf("%s %s\n", text_of(c, "camera"), access(path, R_OK) ? "-" : path);
+    }
+}
+
+static int preview(const struct arguments *a)
+{
+    return ask_and_print(a, about_take("report", a->word[1]), false, print_preview, NULL);
+}
+
+static void print_export(const struct json *e)
+{
+    printf("%s: %.0f files in its ascmhl manifest, %s\n", text_of(e, "path"), number_of(e, "n_files", 0), flag_of(e, "intact") ? "all intact" : "NOT all intact: see the journal");
+}
+
+static int export(const struct arguments *a)
+{
+    struct json *answer = NULL;
+    const int err = ask_and_print(a, about_take("export", a->word[1]), false, print_export, &answer);
+    const bool good = !err && flag_of(answer, "result.intact");
+    json_free(answer);
+    return good ? EXIT_DONE : EXIT_FAILED;
+}
+
+static int calibrate(const struct arguments *a)
+{
+    struct json *r = request_of("calibrate"), *answer = NULL;
+    json_set_string(r, "what", a->word[1]);
+    if (a->shots)
+        json_set_int(r, "shots", a->shots);
+    const int err = ask_and_print(a, r, true, print_lag, &answer);
+    if (err)
+        return err;
+    const bool good = !text_of(answer, "result.outcome")[0];
+    if (!good)
+        log_error("rigctl: %s", text_of(answer, "result.outcome"));
+    json_free(answer);
+    return good ? EXIT_DONE : EXIT_FAILED;
+}
+
+static int about_camera(const struct arguments *a, const char *what)
+{
+    struct json *r = request_of(what);
+    json_set_string(r, "camera", a->word[1]);
+    return ask_and_print(a, r, false, NULL, NULL);
+}
+
+static int identify(const struct arguments *a)
+{
+    return about_camera(a, "identify");
+}
+
+static int reinstate(const struct arguments *a)
+{
+    return about_camera(a, "reinstate");
+}
+
+static int cancel(const struct arguments *a)
+{
+    return ask_and_print(a, request_of("cancel"), false, NULL, NULL);
+}
+
+static void print_takes(const struct json *t)
+{
+    for (int i = 0; i < json_length(t, "takes"); i++) {
+        const struct json *e = element(t, "takes", i);
+        printf("%-44s %-10s %4.0f/%-4.0f %9.1f MB  %s\n", text_of(e, "id"), text_of(e, "state"), number_of(e, "n_delivered", 0), number_of(e, "n_expected", 0),
+               1e-6 * number_of(e, "bytes", 0), text_of(e, "reason"));
+    }
+}
+
+static int takes(const struct arguments *a)
+{
+    return ask_and_print(a, request_of("takes"), false, print_takes, NULL);
+}
+
+static void print_text(const struct json *m)
+{
+    fputs(text_of(m, "text"), stdout);
+}
+
+static int metrics(const struct arguments *a)
+{
+    return ask_and_print(a, request_of("metrics"), false, print_text, NULL);
+}
+
+// Every event as a line of JSON, until the daemon ends.
+static int events(const struct arguments *a)
+{
+    struct line_reader r = { .fd = connect_to(a->socket_path) };
+    if (r.fd < 0)
+        return EXIT_FAILED;
+    send_request(r.fd, request_of("subscribe"));
+    for (struct json *m; (m = next_message(&r));) {
+        char *text = json_get(m, "event") ? json_text(m) : NULL;
+        if (text)
+            puts(text);
+        fflush(stdout);
+        free(text);
+        json_free(m);
+    }
+    close(r.fd);
+    free(r.bytes);
+    return EXIT_FAILED;
+}
+
+static const struct {
+    const char *name, *operand;
+    int (*run)(const struct arguments *a);
+    const char *what;
+} commands[] = {
+    { "status", NULL, status, "the rig and each camera; --watch: live" },
+    { "doctor", NULL, doctor, "what in this machine will fail before it fails" },
+    { "preflight", NULL, preflight, "are all cameras fit for a take?" },
+    { "capture", NULL, capture, "make a take; --name, --without-missing" },
+    { "cancel", NULL, cancel, "stop a take; after the shot its frames are fetched all the same" },
+    { "takes", NULL, takes, "list takes" },
+    { "report", "TAKE", report, "one take, camera by camera" },
+    { "preview", "TAKE", preview, "where a take's thumbnails are" },
+    { "resume", "TAKE", resume, "fetch what a take still misses" },
+    { "export", "TAKE", export, "write and check a take's ASC MHL manifest for hand-over" },
+    { "calibrate", "lag", calibrate, "measure each body's shutter lag; --shots" },
+    { "identify", "CAMERA", identify, "let a camera show itself" },
+    { "reinstate", "CAMERA", reinstate, "try a quarantined camera again, now" },
+    { "metrics", NULL, metrics, "figures as Prometheus text" },
+    { "events", NULL, events, "what happens, as JSON lines" },
+};
+enum { N_COMMANDS = sizeof(commands) / sizeof(commands[0]) };
+
+static const struct argp_option option_list[] = {
+    { "socket", 's', "PATH", 0, "rigd's socket (RIGD_SOCKET, else /run/rigd/rigd.sock)", 0 },
+    { "json", 'j', NULL, 0, "print the answer as JSON", 0 },
+    { "watch", 'w', NULL, 0, "status: live", 0 },
+    { "name", 'n', "NAME", 0, "capture: of the take", 0 },
+    { "without-missing", 'm', NULL, 0, "capture: leave cameras out that are not fit", 0 },
+    { "shots", 'k', "N", 0, "calibrate: how many (rigd.conf's)", 0 },
+    { 0 },
+};
+
+static error_t parse(int key, char *arg, struct argp_state *state)
+{
+    struct arguments *a = state->input;
+    switch (key) {
+    case 's':
+        a->socket_path = arg;
+        return 0;
+    case 'j':
+        a->json = true;
+        return 0;
+    case 'w':
+        a->watch = true;
+        return 0;
+    case 'n':
+        a->name = arg;
+        return 0;
+    case 'm':
+        a->without_missing = true;
+        return 0;
+    case 'k':
+        a->shots = atoi(arg);
+        if (a->shots < 3 || a->shots > 1000)
+            argp_error(state, "--shots: found '%s', expected 3 to 1000", arg);
+        return 0;
+    case ARGP_KEY_ARG:
+        if (a->n_words == 2)
+            argp_error(state, "found '%s', expected nothing more", arg);
+        a->word[a->n_words++] = arg;
+        return 0;
+    default:
+        return ARGP_ERR_UNKNOWN;
+    }
+}
+
+static char *help(int key, const char *text, void *input)
+{
+    (void)input;
+    if (key != ARGP_KEY_HELP_POST_DOC)
+        return (char *)(uintptr_t)text;
+    char *out = NULL;
+    size_t n;
+    FILE *f = open_memstream(&out, &n);
+    if (!f)
+        return NULL;
+    fputs("Commands:\n", f);
+    for (int i = 0; i < N_COMMANDS; i++)
+        fprintf(f, "  %-9s %-7s %s\n", commands[i].name, commands[i].operand ? commands[i].operand : "", commands[i].what);
+    fputs("\nExit status: 0 done, 1 failed (a take: not verified), 2 usage.", f);
+    fclose(f);
+    return out;
+}
+
+int main(int argc, char **argv)
+{
+    static const struct argp argp = { option_list, parse, "COMMAND [TAKE|CAMERA|lag]", "Talks to rigd, the daemon of the rig.\v", NULL, help, NULL };
+    struct arguments a = { .name = "take" };
+    argp_err_exit_status = EXIT_USAGE;
+    argp_program_version = "rigctl (studiorig) " STUDIORIG_VERSION;
+    log_set_program("rigctl");
+    a.socket_path = getenv("RIGD_SOCKET") ? getenv("RIGD_SOCKET") : "/run/rigd/rigd.sock";
+    argp_parse(&argp, argc, argv, 0, NULL, &a);
+    for (int i = 0; a.n_words && i < N_COMMANDS; i++) {
+        if (strcmp(commands[i].name, a.word[0]))
+            continue;
+        if (!commands[i].operand != (a.n_words == 1)) {
+            fprintf(stderr, "rigctl %s: found %d operands, expected %s\n", a.word[0], a.n_words - 1, commands[i].operand ? commands[i].operand : "none");
+            return EXIT_USAGE;
+        }
+        return commands[i].run(&a);
+    }
+    fprintf(stderr, "rigctl: %s%s%s; rigctl --help lists the commands\n", a.n_words ? "unknown command '" : "expected a command", a.n_words ? a.word[0] : "", a.n_words ? "'" : "");
+    return EXIT_USAGE;
+}
