@@ -41,8 +41,8 @@ SOLVER := $(addprefix solver/,alternating.c cameras.c cameras_bundler.c cameras_
 KERNELS := $(addprefix solver/kernels/,kernels.c kernels_ref.c kernels_portable.c kernels_avx2.c kernels_avx512.c)
 COMMANDS := $(addprefix solver/commands/,arguments.c brdf.c compare.c export.c inputs.c lights.c output.c render.c report.c solve.c solve_materials.c solved.c synth.c visibility.c)
 LIBRARY := $(TAKE) $(SOLVER) $(KERNELS)
-RIG := $(addprefix rigd/,calibrate.c camera.c config.c container.c control.c describe.c digest.c doctor.c edges.c ingest.c ledger.c manifest.c personality.c rig.c \
-  trigger.c trigger_gpio.c trigger_lines.c trigger_sim.c trigger_software.c)
+RIG := $(addprefix rigd/,calibrate.c camera.c config.c container.c control.c describe.c digest.c doctor.c edges.c ingest.c ledger.c manifest.c personality.c rig.c trigger.c \
+  trigger_gpio.c trigger_lines.c trigger_sim.c trigger_software.c)
 RIG_PROGRAMS := rigctl rigd rigd-camera
 LIBS_RIG = -ljansson -linih -lsystemd -lxxhash -lgpiod -lm
 LIBS_CAMERA = -lgphoto2 -lgphoto2_port -ljansson -lxxhash -lm
@@ -55,7 +55,7 @@ FUZZED := $(TAKE) $(addprefix solver/,cameras.c cameras_bundler.c cameras_colmap
 TESTS := $(addprefix test_,alternating brdf cameras cameras_import compare csv disney emitters export gltf_brdf image joint json judge levels \
   lights lm materials mesh misfit normal_equations orientation panorama parallel pcg photometric rays render report rigsim samples shapes stability \
   synth take texels vec3 visibility) check_kernels
-RIG_TESTS := $(addprefix test_,camera config control digest manifest rig studios trigger)
+RIG_TESTS := $(addprefix test_,camera camera_worker config container control digest ingest manifest personality rig studios trigger)
 FUZZERS := cameras cameras_import csv exr hdr json lights mesh
 
 # ---- rules --------------------------------------------------------------------------------------------------------------

@@ -492,8 +492,10 @@ static void merge_settings(struct reader *r)
             }
 }
 
+// GPIO lines are one row of numbers; a board and the simulated rig have a row for each purpose.
 struct use {
     int line;
+    const char *purpose;
     char what[48];
 };
 
@@ -501,10 +503,10 @@ static void use_line(struct reader *r, struct use *uses, int *n, int line, const
 {
     if (line == CONFIG_NONE)
         return;
-    struct use u = { .line = line };
+    struct use u = { .line = line, .purpose = r->config->trigger.kind == TRIGGER_GPIO ? "any" : what };
     snprintf(u.what, sizeof(u.what), "%s%.23s%s%s", camera[0] ? "camera " : "", camera, camera[0] ? "'s " : "[trigger] ", what);
     for (int i = 0; i < *n; i++)
-        if (uses[i].line == line) {
+        if (uses[i].line == line && !strcmp(uses[i].purpose, u.purpose)) {
             complain(r, at, "line %d is %s already, it cannot be %s too", line, uses[i].what, u.what);
             return;
         }

@@ -2,6 +2,13 @@
 //
 // One thread does everything but touch the disk; a second one does that, job after job, so that a slow fsync holds up no camera. After
 // each event the rig's actions are carried out and its next deadline is set (look_at_rig). Decisions are the rig's, not made here.
+#include <systemd/sd-daemon.h>
+#include <systemd/sd-event.h>
+#include <systemd/sd-journal.h>
+#undef LOG_DEBUG // syslog.h's macros would hide log.h's levels
+#undef LOG_INFO
+#undef LOG_WARNING
+
 #include "rigd/daemon.h"
 #include "rigd/control.h"
 #include "rigd/describe.h"
@@ -27,9 +34,6 @@
 #include <sys/socket.h>
 #include <sys/statvfs.h>
 #include <sys/wait.h>
-#include <systemd/sd-daemon.h>
-#include <systemd/sd-event.h>
-#include <systemd/sd-journal.h>
 #include <time.h>
 #include <unistd.h>
 
@@ -70,6 +74,7 @@ struct daemon {
     struct rig *rig;
     struct control *control;
     struct trigger *trigger;
+    struct trigger_host host; // borrowed by the trigger
     const char *trigger_word;
     struct worker *worker;
     sd_event *event;
@@ -353,9 +358,11 @@ static int spawn_worker(struct daemon *d, struct worker *w)
     posix_spawn_file_actions_t files;
     posix_spawnattr_t attributes;
     sigset_t none, all;
-    char *argv[] = { d->worker_path, d->config.camera[w->camera].name, NULL };
+    char title[60]; // what ps shows
+    char *argv[] = { title, NULL };
     if (socketpair(AF_UNIX, SOCK_SEQPACKET | SOCK_CLOEXEC, 0, fd))
         return -errno;
+    snprintf(title, sizeof(title), "rigd-camera %s", d->config.camera[w->camera].name);
     const int room = 2 * CAMERA_MESSAGE_MAX;
     setsockopt(fd[0], SOL_SOCKET, SO_SNDBUF, &room, sizeof(room));
     setsockopt(fd[1], SOL_SOCKET, SO_SNDBUF, &room, sizeof(room));
@@ -482,13 +489,13 @@ static int on_trigger(sd_event_source *source, int fd, uint32_t events, void *ar
 static int open_the_trigger(sd_event_source *source, uint64_t usec, void *arg)
 {
     struct daemon *d = arg;
-    const struct trigger_host host = { on_fired, on_feedback, on_button, on_press_camera, on_trigger_broken, d };
     static const char *const kinds[] = { "software (unsynchronised)", "gpio", "usb", "simulated" };
     (void)usec;
+    d->host = (struct trigger_host){ on_fired, on_feedback, on_button, on_press_camera, on_trigger_broken, d };
     d->trigger_io = sd_event_source_disable_unref(d->trigger_io);
     trigger_close(d->trigger);
     d->trigger = NULL;
-    int err = trigger_open(&d->trigger, &d->config, &host);
+    int err = trigger_open(&d->trigger, &d->config, &d->host);
     if (!err)
         err = sd_event_add_io(d->event, &d->trigger_io, trigger_fd(d->trigger), EPOLLIN, on_trigger, d);
     d->trigger_word = err < 0 ? "not there" : kinds[d->config.trigger.kind];
