@@ -78,11 +78,11 @@ static struct timespec timespec_of(int64_t ns)
     return (struct timespec){ .tv_sec = ns / 1000000000, .tv_nsec = ns % 1000000000 };
 }
 
-static void prefer_realtime(bool say)
+static void prefer_realtime(void)
 {
     const struct sched_param p = { .sched_priority = PRIORITY };
     prctl(PR_SET_TIMERSLACK, 1UL);
-    if (pthread_setschedparam(pthread_self(), SCHED_FIFO, &p) && say)
+    if (pthread_setschedparam(pthread_self(), SCHED_FIFO, &p))
         log_info("trigger: no real-time priority: edges come as late as the host is busy (give rigd LimitRTPRIO=%d)", PRIORITY);
 }
 
@@ -113,15 +113,14 @@ static void guard_run(struct trigger_lines *t, int guard_fd)
     sigset_t every;
     sigfillset(&every);
     sigprocmask(SIG_SETMASK, &every, NULL); // Ctrl-C at a terminal, or systemd's SIGTERM to the whole group, are for rigd
-    prctl(PR_SET_NAME, "rigd-guard");
-    prefer_realtime(false);
+    prctl(PR_SET_NAME, "rigd-guard"); // of ordinary priority: it is there for when others go wrong
     guard_close_others(guard_fd);
     memset(all, 0xff, sizeof(all));
     for (;;) {
         struct pollfd p = { .fd = guard_fd, .events = POLLIN };
         char bytes[64];
         const int n = poll(&p, 1, atomic_load(&t->shared->active) ? GUARD_LOOK_MS : -1);
-        if (n > 0 && recv(guard_fd, bytes, sizeof(bytes), MSG_DONTWAIT) == 0)
+        if (n > 0 && recv(guard_fd, bytes, sizeof(bytes), MSG_DONTWAIT) <= 0) // whatever it is: never one that spins
             break;
         const int64_t now_ns = clock_ns();
         bool over = false;
@@ -251,7 +250,7 @@ static void *run(void *arg)
 {
     struct trigger_lines *t = arg;
     prctl(PR_SET_NAME, "rigd-edges");
-    prefer_realtime(true);
+    prefer_realtime();
     pthread_mutex_lock(&t->lock);
     while (!t->quit) {
         const int64_t next_ns = edges_next_ns(&t->edges);

@@ -674,6 +674,10 @@ static void a_button_is_heard_once_however_it_bounces(void **state)
         move(BUTTON, i % 2 == 0, down_ns + i * MS / 2);
     serve(t, &heard.n_button, 1);
     assert_int_equal(heard.button_ns, down_ns); // the first touch, not the end of the debounce time
+    move(BUTTON, false, clock_ns()); // held, but loose for an instant
+    move(BUTTON, true, clock_ns());
+    serve_for(t, 60);
+    assert_int_equal(heard.n_button, 1);
     for (int i = 0; i < 8; i++) // let go, bouncing
         move(BUTTON, i % 2 == 1, clock_ns());
     move(BUTTON, false, clock_ns());

@@ -9,7 +9,7 @@ _rigctl_ask() { # command, key: the values of that key in its JSON
 _rigctl() {
     local cur=${COMP_WORDS[COMP_CWORD]} before=${COMP_WORDS[COMP_CWORD - 1]} command='' i
     COMPREPLY=()
-    [[ $before == --socket || $before == --name ]] && return
+    [[ $before == --socket || $before == --name || $before == --shots ]] && return
     for ((i = 1; i < COMP_CWORD; i++)); do
         case ${COMP_WORDS[i]} in
         --socket) ((i++)) ;;
@@ -18,9 +18,9 @@ _rigctl() {
         esac
     done
     case $command in
-    '') mapfile -t COMPREPLY < <(compgen -W "status doctor preflight capture panorama preview report calibrate identify reinstate cancel takes resume export \
-        develop --socket --json --help --version" -- "$cur") ;;
-    calibrate) mapfile -t COMPREPLY < <(compgen -W "lag colour" -- "$cur") ;;
+    '') mapfile -t COMPREPLY < <(compgen -W "status doctor preflight capture cancel takes report preview resume export calibrate identify reinstate metrics events \
+        panorama develop --socket --json --help --version" -- "$cur") ;;
+    calibrate) mapfile -t COMPREPLY < <(compgen -W "lag colour --shots" -- "$cur") ;;
     identify | reinstate) mapfile -t COMPREPLY < <(compgen -W "$(_rigctl_ask status name)" -- "$cur") ;;
     preview | report | resume | export) mapfile -t COMPREPLY < <(compgen -W "$(_rigctl_ask takes id)" -- "$cur") ;;
     status) mapfile -t COMPREPLY < <(compgen -W "--watch" -- "$cur") ;;
