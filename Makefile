@@ -11,7 +11,8 @@ BUILD := build$(if $(filter-out release,$(VARIANT)),/$(VARIANT))
 MACHINE := $(shell uname -m)
 
 # ---- packages (Debian 12; the same names in Debian 13) ----------------------------------------------------------------
-PACKAGES := gcc make pkg-config libopenexr-dev libembree-dev libassimp-dev libjansson-dev libtiff-dev libpng-dev libjpeg-dev libexpat1-dev liblapacke-dev libopenblas-dev libcmocka-dev perl help2man libgphoto2-dev libgpiod-dev libinih-dev libsystemd-dev libxxhash-dev
+PACKAGES := gcc make pkg-config libopenexr-dev libembree-dev libassimp-dev libjansson-dev libtiff-dev libpng-dev libjpeg-dev libexpat1-dev liblapacke-dev libopenblas-dev libcmocka-dev perl help2man \
+  libgphoto2-dev libgpiod-dev libinih-dev libsystemd-dev libxxhash-dev
 PACKAGES_FUZZ := clang libclang-rt-dev
 PACKAGES_BENCH := libceres-dev g++ gnuplot-nox
 
@@ -30,32 +31,19 @@ ISA_avx2 := -mavx2 -mfma -ffp-contract=fast
 ISA_avx512 := -mavx512f -mavx512dq -mavx512bw -mavx512vl -mfma -mprefer-vector-width=512 -ffp-contract=fast
 endif
 
-# ---- what is built ------------------------------------------------------------------------------------------------------
-TAKE := $(addprefix solver/take/,atomic_file.c image.c image_exr.c image_hdr.c image_jpeg.c image_png.c image_tiff.c json.c log.c progress.c take.c)
-SOLVER := $(addprefix solver/,alternating.c cameras.c cameras_bundler.c cameras_colmap.c cameras_format.c cameras_frame.c \
-  cameras_meshroom.c cameras_metashape.c cameras_realitycapture.c compare.c csv.c disney.c emitters.c export.c export_glb.c \
-  export_materialx.c export_obj.c gltf_brdf.c interreflection.c joint.c levels.c lights.c lm.c materials.c mesh.c mesh_gltf_floats.c mesh_import.c misfit.c normal_equations.c \
-  orientation.c panorama.c parallel.c pcg.c photometric.c picture_size.c rays.c regions.c relocate.c render.c report.c samples.c shapes.c stage1.c synth.c \
-  texel_fit.c texels.c visibility.c xml.c)
-KERNELS := $(addprefix solver/kernels/,kernels.c kernels_ref.c kernels_portable.c kernels_avx2.c kernels_avx512.c)
-COMMANDS := $(addprefix solver/commands/,arguments.c brdf.c compare.c export.c inputs.c lights.c output.c render.c report.c solve.c solve_materials.c solved.c synth.c visibility.c)
-LIBRARY := $(TAKE) $(SOLVER) $(KERNELS)
-RIG := $(addprefix rigd/,calibrate.c camera.c config.c container.c control.c describe.c digest.c doctor.c edges.c ingest.c ledger.c manifest.c personality.c rig.c trigger.c trigger_gpio.c trigger_lines.c trigger_sim.c trigger_software.c)
+# ---- what is built: every source of a folder ------------------------------------------------------------------------------
+TAKE := $(wildcard solver/take/*.c)
+LIBRARY := $(TAKE) $(filter-out solver/main.c,$(wildcard solver/*.c)) $(wildcard solver/kernels/*.c)
+COMMANDS := $(wildcard solver/commands/*.c)
 RIG_PROGRAMS := rigctl rigd rigd-camera
+RIG := $(filter-out $(addprefix rigd/,camera_gphoto.c camera_worker.c daemon.c main.c rigctl.c),$(wildcard rigd/*.c))
+RIGSIM := $(wildcard tests/rigsim/*.c)
+RIGSIM_LIB := $(filter-out $(addprefix tests/rigsim/,client.c main.c server.c server_faults.c server_shutter.c),$(RIGSIM))
 LIBS_RIG = -ljansson -linih -lsystemd -lxxhash -lgpiod -lm
 LIBS_CAMERA = -lgphoto2 -lgphoto2_port -ljansson -lxxhash -lm
-RIGSIM_LIB := $(addprefix tests/rigsim/,body.c dataset.c faults.c frame.c jpeg.c personality.c personality_builtin.c ptp.c ptp_canon.c ptp_datasets.c \
-  ptp_nikon.c ptpip.c raw_dng.c scene.c)
-RIGSIM := $(RIGSIM_LIB) $(addprefix tests/rigsim/,main.c server.c server_faults.c server_shutter.c)
-FUZZED := $(TAKE) $(addprefix solver/,cameras.c cameras_bundler.c cameras_colmap.c cameras_format.c cameras_meshroom.c \
-  cameras_metashape.c cameras_realitycapture.c csv.c lights.c mesh.c mesh_gltf_floats.c mesh_import.c orientation.c panorama.c parallel.c \
-  picture_size.c texels.c xml.c)
-TESTS := $(addprefix test_,alternating brdf cameras cameras_import compare csv disney emitters export gltf_brdf image interreflection joint json judge levels lights lm materials mesh misfit normal_equations orientation panorama parallel pcg photometric rays render report rigsim rigsim_wire samples shapes stability synth take texels vec3 visibility) check_kernels
-  synth take texels vec3 visibility) check_kernels
-RIG_TESTS := $(addprefix test_,calibrate camera camera_worker config container control digest ingest ledger manifest personality rig studios trigger)
-FUZZERS := cameras cameras_import csv exr hdr json lights mesh config control ptpip camera container personality
-  picture_size.c texels.c xml.c) $(addprefix rigd/,config.c control.c)
-  picture_size.c texels.c xml.c) $(addprefix rigd/,camera.c config.c container.c control.c personality.c)
+TESTS := $(basename $(notdir $(wildcard tests/test_*.c))) check_kernels
+FUZZERS := $(patsubst fuzz_%,%,$(basename $(notdir $(wildcard tests/fuzz/fuzz_*.c))))
+FUZZED := $(LIBRARY) $(RIG) $(RIGSIM_LIB) # what a fuzzer calls of these is linked
 
 # ---- rules --------------------------------------------------------------------------------------------------------------
 object = $(patsubst %.c,$(BUILD)/obj/%.o,$(1))
@@ -102,31 +90,31 @@ $(BUILD)/bin/rigctl: $(call object,rigd/rigctl.c) $(BUILD)/librig.a $(BUILD)/lib
 	$(link_rig) $(LIBS_RIG) -o $@
 $(BUILD)/bin/rigd-camera: $(call object,rigd/camera_gphoto.c rigd/camera_worker.c) $(BUILD)/librig.a $(BUILD)/libtake.a
 	$(link_rig) $(LIBS_CAMERA) -o $@
-$(BUILD)/bin/rigsim: $(call object,$(RIGSIM)) $(BUILD)/libstudiorig.a
+$(BUILD)/bin/rigsim: $(call object,$(filter-out %/client.c,$(RIGSIM))) $(BUILD)/libstudiorig.a
 	@mkdir -p $(@D)
 	@$(if $(V),,echo '  LD $@')
 	$(Q)$(CC) $(CFLAGS_ALL) $^ $(LIBS) -o $@
-$(BUILD)/tests/%: $(BUILD)/obj/tests/%.o $(BUILD)/libstudiorig.a
+$(BUILD)/librigsim.a: $(call object,$(RIGSIM_LIB) tests/rigsim/client.c)
+	@rm -f $@
+	@$(if $(V),,echo '  AR $@')
+	$(Q)ar rcsD $@ $^
+$(BUILD)/tests/%: $(BUILD)/obj/tests/%.o $(BUILD)/librigsim.a $(BUILD)/librig.a $(BUILD)/libstudiorig.a
 	@mkdir -p $(@D)
 	@$(if $(V),,echo '  LD $@')
-	$(Q)$(CC) $(CFLAGS_ALL) $^ -lcmocka $(LIBS) -o $@
-$(addprefix $(BUILD)/tests/,$(RIG_TESTS)): $(BUILD)/tests/%: $(BUILD)/obj/tests/%.o $(BUILD)/librig.a $(BUILD)/libtake.a
-	$(link_rig) -lcmocka $(LIBS_RIG) -o $@
-$(BUILD)/tests/test_camera_worker: | $(BUILD)/bin/rigd-camera $(BUILD)/bin/rigsim
-$(BUILD)/tests/test_rigsim: $(call object,$(RIGSIM_LIB))
-$(BUILD)/tests/test_rigsim: LIBS := $(BUILD)/libstudiorig.a $(LIBS)
-$(BUILD)/tests/test_rigsim_wire: $(call object,$(addprefix tests/rigsim/,client.c dataset.c ptpip.c)) | $(BUILD)/bin/rigsim
+	$(Q)$(CC) $(CFLAGS_ALL) -Wl,--as-needed $^ -lcmocka $(LIBS_RIG) $(LIBS) -o $@
+$(BUILD)/tests/test_camera_worker $(BUILD)/tests/test_rigsim_wire: | $(BUILD)/bin/rigd-camera $(BUILD)/bin/rigsim
 $(BUILD)/tests/bench/stability_joint: $(call object,solver/commands/arguments.c)
 $(BUILD)/tests/test_pcg: LIBS += $(if $(wildcard /usr/include/suitesparse/cholmod.h),-lcholmod)
 $(BUILD)/fuzz/obj/%.o: %.c Makefile | deps-fuzz
 	@mkdir -p $(@D)
 	@$(if $(V),,echo '  CC (fuzz) $<')
 	$(Q)clang $(FUZZ_FLAGS) -MMD -MP -c $< -o $@
-$(BUILD)/fuzz/fuzz_ptpip: $(patsubst %.c,$(BUILD)/fuzz/obj/%.o,$(addprefix tests/rigsim/,body.c dataset.c personality.c personality_builtin.c ptp.c \
-  ptp_canon.c ptp_datasets.c ptp_nikon.c ptpip.c))
-$(BUILD)/fuzz/fuzz_%: $(BUILD)/fuzz/obj/tests/fuzz/fuzz_%.o $(patsubst %.c,$(BUILD)/fuzz/obj/%.o,$(FUZZED))
+$(BUILD)/fuzz/libfuzzed.a: $(patsubst %.c,$(BUILD)/fuzz/obj/%.o,$(FUZZED))
+	@rm -f $@
+	$(Q)ar rcsD $@ $^
+$(BUILD)/fuzz/fuzz_%: $(BUILD)/fuzz/obj/tests/fuzz/fuzz_%.o $(BUILD)/fuzz/libfuzzed.a
 	@$(if $(V),,echo '  LD (fuzz) $@')
-	$(Q)clang $(FUZZ_FLAGS) -fsanitize=fuzzer $^ $(LIBS) -linih -o $@
+	$(Q)clang $(FUZZ_FLAGS) -fsanitize=fuzzer -Wl,--as-needed $^ $(LIBS_RIG) $(LIBS) -o $@
 
 # dpkg-query knows what is there; apt-get is asked only for what is not.
 install_packages = @missing=$$(for p in $(1); do dpkg-query -W -f='$${Status}\n' $$p 2>/dev/null | grep -q 'ok installed' || echo $$p; done); \
@@ -140,12 +128,10 @@ deps-fuzz: ; $(call install_packages,$(PACKAGES_FUZZ))
 deps-bench: deps ; $(call install_packages,$(PACKAGES_BENCH))
 
 # ---- tests ----------------------------------------------------------------------------------------------------------------
-TEST_PROGRAMS := $(addprefix $(BUILD)/tests/,$(TESTS) $(RIG_TESTS))
+TEST_PROGRAMS := $(addprefix $(BUILD)/tests/,$(TESTS))
+TEST_SCRIPTS := $(wildcard tests/check_*.sh tests/test_*.sh)
 test: deps all $(TEST_PROGRAMS)
-	@CMOCKA_MESSAGE_OUTPUT=TAP BIN=$(BUILD)/bin prove --timer --merge --exec '' tests/check_includes.sh tests/check_gpiod.sh $(TEST_PROGRAMS) tests/test_commands.sh tests/test_rig_chain.sh
-	@CMOCKA_MESSAGE_OUTPUT=TAP BIN=$(BUILD)/bin prove --timer --merge --exec '' tests/check_includes.sh tests/check_gpiod.sh $(TEST_PROGRAMS) tests/test_commands.sh tests/test_rigsim.sh
-$(BUILD)/tests/vm/test_gpio_vm: $(BUILD)/obj/tests/vm/test_gpio_vm.o $(BUILD)/librig.a $(BUILD)/libtake.a
-	$(link_rig) -Wl,--as-needed -lcmocka $(LIBS_RIG) -o $@
+	@CMOCKA_MESSAGE_OUTPUT=TAP BIN=$(BUILD)/bin prove --timer --merge --exec '' $(TEST_PROGRAMS) $(TEST_SCRIPTS)
 test-vm: deps $(BUILD)/tests/vm/test_gpio_vm
 	@prove --timer --verbose --exec '' tests/vm/run.sh :: $(BUILD)/vm $(BUILD)/tests/vm/test_gpio_vm
 check-includes:
@@ -208,8 +194,6 @@ install: all $(MAN) $(RIG_MAN)
 	install -D -m 644 -t $(DESTDIR)$(PREFIX)/share/man/man1 $(MAN)
 	install -D -m 644 -t $(DESTDIR)$(PREFIX)/share/man/man1 $(BUILD)/man/rigctl.1
 	install -D -m 644 -t $(DESTDIR)$(PREFIX)/share/man/man8 $(BUILD)/man/rigd.8
-	install -D -m 644 -t $(DESTDIR)$(PREFIX)/share/studiorig/rigs $(wildcard config/rig-*.conf)
-	install -D -m 644 -t $(DESTDIR)$(PREFIX)/share/studiorig/rigs/cameras $(wildcard config/cameras/*.conf)
 	install -D -m 644 config/blender/import_studiorig.py $(DESTDIR)$(PREFIX)/share/studiorig/blender/import_studiorig.py
 	install -D -m 644 config/completion/rigsolve.bash $(DESTDIR)$(PREFIX)/share/bash-completion/completions/rigsolve
 	install -D -m 644 config/completion/rigctl.bash $(DESTDIR)$(PREFIX)/share/bash-completion/completions/rigctl
@@ -220,12 +204,11 @@ install: all $(MAN) $(RIG_MAN)
 	install -D -m 644 config/systemd/71-rigd.rules $(DESTDIR)$(PREFIX)/lib/udev/rules.d/71-rigd.rules
 	install -D -m 644 config/systemd/rigd.sysusers $(DESTDIR)$(PREFIX)/lib/sysusers.d/rigd.conf
 	install -D -m 644 config/systemd/rigd.tmpfiles $(DESTDIR)$(PREFIX)/lib/tmpfiles.d/rigd.conf
-	install -D -m 644 -t $(DESTDIR)$(PREFIX)/share/doc/studiorig README.md LICENSE solver/NOTATION.md
 	install -D -m 644 -t $(DESTDIR)$(PREFIX)/share/doc/studiorig README.md LICENSE solver/NOTATION.md rigd/CONTROL.md
 clean:
 	rm -rf build
 help:
-	@echo 'make            build/bin/rigsolve                make test      everything that must hold (installs packages)'
+	@echo 'make            the programs, in build/bin/       make test      everything that must hold (installs packages)'
 	@echo 'make demo       a synthetic studio, end to end    make fuzz      libFuzzer on every parser (FUZZ_SECONDS=60)'
 	@echo 'make test-vm    GPIO on a simulated chip, in a virtual machine'
 	@echo 'make bench      seconds and errors of kernels     make chart     speed against accuracy      make stability  where it fails'
