@@ -82,7 +82,7 @@ start
 check "all cameras open" ready
 check "preflight finds them fit" "$BIN/rigctl" preflight
 check "a take from request to verified" "$BIN/rigctl" capture --name first
-check "it says how far apart the shutters opened" grep -q 'shutters: spread' "$D/out"
+check "it says how far apart the shutters opened" sh -c "$BIN/rigctl report \$(ls $D/takes) | grep 'shutters: spread'"
 check "a second rigd on the same socket is refused" sh -c "! $BIN/rigd --config $D/rigd.conf --socket $D/s"
 check "lag is measured" "$BIN/rigctl" calibrate lag --shots 3
 check "a camera that nobody knows is refused" sh -c "! $BIN/rigctl identify Z99"
