@@ -51,12 +51,12 @@ RIGSIM_LIB := $(addprefix tests/rigsim/,body.c dataset.c faults.c frame.c jpeg.c
 RIGSIM := $(RIGSIM_LIB) $(addprefix tests/rigsim/,main.c server.c server_faults.c server_shutter.c)
 FUZZED := $(TAKE) $(addprefix solver/,cameras.c cameras_bundler.c cameras_colmap.c cameras_format.c cameras_meshroom.c \
   cameras_metashape.c cameras_realitycapture.c csv.c lights.c mesh.c mesh_gltf_floats.c mesh_import.c orientation.c panorama.c parallel.c \
-  picture_size.c texels.c xml.c)
+  picture_size.c texels.c xml.c) $(addprefix rigd/,config.c control.c)
 TESTS := $(addprefix test_,alternating brdf cameras cameras_import compare csv disney emitters export gltf_brdf image joint json judge levels \
   lights lm materials mesh misfit normal_equations orientation panorama parallel pcg photometric rays render report rigsim samples shapes stability \
   synth take texels vec3 visibility) check_kernels
-RIG_TESTS := $(addprefix test_,camera camera_worker config container control digest ingest manifest personality rig studios trigger)
-FUZZERS := cameras cameras_import csv exr hdr json lights mesh
+RIG_TESTS := $(addprefix test_,calibrate camera camera_worker config container control digest ingest ledger manifest personality rig studios trigger)
+FUZZERS := cameras cameras_import config control csv exr hdr json lights mesh
 
 # ---- rules --------------------------------------------------------------------------------------------------------------
 object = $(patsubst %.c,$(BUILD)/obj/%.o,$(1))
@@ -122,7 +122,7 @@ $(BUILD)/fuzz/obj/%.o: %.c Makefile | deps-fuzz
 	$(Q)clang $(FUZZ_FLAGS) -MMD -MP -c $< -o $@
 $(BUILD)/fuzz/fuzz_%: $(BUILD)/fuzz/obj/tests/fuzz/fuzz_%.o $(patsubst %.c,$(BUILD)/fuzz/obj/%.o,$(FUZZED))
 	@$(if $(V),,echo '  LD (fuzz) $@')
-	$(Q)clang $(FUZZ_FLAGS) -fsanitize=fuzzer $^ $(LIBS) -o $@
+	$(Q)clang $(FUZZ_FLAGS) -fsanitize=fuzzer $^ $(LIBS) -linih -o $@
 
 # dpkg-query knows what is there; apt-get is asked only for what is not.
 install_packages = @missing=$$(for p in $(1); do dpkg-query -W -f='$${Status}\n' $$p 2>/dev/null | grep -q 'ok installed' || echo $$p; done); \
@@ -138,7 +138,7 @@ deps-bench: deps ; $(call install_packages,$(PACKAGES_BENCH))
 # ---- tests ----------------------------------------------------------------------------------------------------------------
 TEST_PROGRAMS := $(addprefix $(BUILD)/tests/,$(TESTS) $(RIG_TESTS))
 test: deps all $(TEST_PROGRAMS)
-	@CMOCKA_MESSAGE_OUTPUT=TAP BIN=$(BUILD)/bin prove --timer --merge --exec '' tests/check_includes.sh tests/check_gpiod.sh $(TEST_PROGRAMS) tests/test_commands.sh
+	@CMOCKA_MESSAGE_OUTPUT=TAP BIN=$(BUILD)/bin prove --timer --merge --exec '' tests/check_includes.sh tests/check_gpiod.sh $(TEST_PROGRAMS) tests/test_commands.sh tests/test_rig_chain.sh
 $(BUILD)/tests/vm/test_gpio_vm: $(BUILD)/obj/tests/vm/test_gpio_vm.o $(BUILD)/librig.a $(BUILD)/libtake.a
 	$(link_rig) -Wl,--as-needed -lcmocka $(LIBS_RIG) -o $@
 test-vm: deps $(BUILD)/tests/vm/test_gpio_vm
@@ -184,27 +184,36 @@ stability: deps deps-bench $(BUILD)/tests/bench/stability_kernels $(BUILD)/tests
 
 # ---- installation ---------------------------------------------------------------------------------------------------------
 MAN := $(addprefix $(BUILD)/man/rigsolve,.1 $(addprefix -,$(addsuffix .1,$(filter-out arguments inputs output solve_materials solved,$(notdir $(COMMANDS:.c=))))))
-man: $(MAN)
+RIG_MAN := $(addprefix $(BUILD)/man/,rigctl.1 rigd.8)
+man: $(MAN) $(RIG_MAN)
+$(BUILD)/man/rigctl.1: $(BUILD)/bin/rigctl
+	@mkdir -p $(@D)
+	$(Q)help2man -N -n 'asks and tells the daemon of a photogrammetry rig' -o $@ $<
+$(BUILD)/man/rigd.8: $(BUILD)/bin/rigd
+	@mkdir -p $(@D)
+	$(Q)help2man -N -s 8 -n 'fires the cameras of a photogrammetry studio and keeps every frame' -o $@ $<
 $(BUILD)/man/rigsolve.1: $(BUILD)/bin/rigsolve
 	@mkdir -p $(@D)
 	$(Q)help2man -N -n 'from photographs in a studio to relightable materials' -o $@ $<
 $(BUILD)/man/rigsolve-%.1: $(BUILD)/bin/rigsolve
 	@mkdir -p $(@D)
 	$(Q)help2man -N -n 'rigsolve $*' --version-string=$(VERSION) -o $@ "$< $*"
-install: $(BUILD)/bin/rigsolve $(MAN)
-	install -D -m 755 $(BUILD)/bin/rigsolve $(DESTDIR)$(PREFIX)/bin/rigsolve
+install: all $(MAN) $(RIG_MAN)
+	install -D -m 755 -t $(DESTDIR)$(PREFIX)/bin $(addprefix $(BUILD)/bin/,rigsolve $(RIG_PROGRAMS))
 	install -D -m 644 -t $(DESTDIR)$(PREFIX)/share/man/man1 $(MAN)
+	install -D -m 644 -t $(DESTDIR)$(PREFIX)/share/man/man1 $(BUILD)/man/rigctl.1
+	install -D -m 644 -t $(DESTDIR)$(PREFIX)/share/man/man8 $(BUILD)/man/rigd.8
+	install -D -m 644 -t $(DESTDIR)$(PREFIX)/share/studiorig/rigs $(wildcard config/*.conf)
+	install -D -m 644 -t $(DESTDIR)$(PREFIX)/share/studiorig/rigs/cameras $(wildcard config/cameras/*.conf)
 	install -D -m 644 config/blender/import_studiorig.py $(DESTDIR)$(PREFIX)/share/studiorig/blender/import_studiorig.py
 	install -D -m 644 config/completion/rigsolve.bash $(DESTDIR)$(PREFIX)/share/bash-completion/completions/rigsolve
 	install -D -m 644 config/completion/rigctl.bash $(DESTDIR)$(PREFIX)/share/bash-completion/completions/rigctl
-	install -D -m 644 -t $(DESTDIR)$(PREFIX)/share/studiorig/config config/*.conf
-	install -D -m 644 -t $(DESTDIR)$(PREFIX)/share/studiorig/config/cameras config/cameras/*.conf
 	install -D -m 644 config/systemd/rigd.service $(DESTDIR)$(PREFIX)/lib/systemd/system/rigd.service
 	sed -i 's|/usr/local/bin|$(PREFIX)/bin|' $(DESTDIR)$(PREFIX)/lib/systemd/system/rigd.service
 	install -D -m 644 config/systemd/71-rigd.rules $(DESTDIR)$(PREFIX)/lib/udev/rules.d/71-rigd.rules
 	install -D -m 644 config/systemd/rigd.sysusers $(DESTDIR)$(PREFIX)/lib/sysusers.d/rigd.conf
 	install -D -m 644 config/systemd/rigd.tmpfiles $(DESTDIR)$(PREFIX)/lib/tmpfiles.d/rigd.conf
-	install -D -m 644 -t $(DESTDIR)$(PREFIX)/share/doc/studiorig README.md LICENSE solver/NOTATION.md
+	install -D -m 644 -t $(DESTDIR)$(PREFIX)/share/doc/studiorig README.md LICENSE solver/NOTATION.md rigd/CONTROL.md
 clean:
 	rm -rf build
 help:

@@ -342,7 +342,7 @@ static const char *set_value(const struct key *key, void *target, const char *va
         }
         if (key->type == NAME && !is_plain(value))
             return "letters, digits, - and _";
-        if (key->type == PATH && value[0] != '/')
+        if (key->type == PATH && value[0] != '/' && !(value[0] == '@' && value[1] && !strcmp(key->name, "address"))) // abstract sockets
             return "a path that begins with /";
         memcpy(field, value, strlen(value) + 1);
         return NULL;

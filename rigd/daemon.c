@@ -1240,6 +1240,7 @@ static int run(struct daemon *d)
     if (err)
         return err;
     d->disk_runs = true;
+    ledger_remove_leftovers(d->takes_dir);
     find_unfinished(d);
     rig_start(d->rig, now_ns());
     sd_notifyf(0, "READY=1\nSTATUS=%d cameras", d->config.n_cameras);

@@ -460,9 +460,34 @@ static int sync_folder(const char *dir)
 static const char *const folders[] = { "raw", "thumbnails", "linear", "geometry", "geometry/cameras" };
 enum { N_FOLDERS = sizeof(folders) / sizeof(folders[0]) };
 
+static bool is_part(const char *name) // .NAME.tag.part of atomic_file, NAME.part of ingest; no camera's name holds a dot
+{
+    const size_t n = strlen(name);
+    return n > 5 && !strcmp(name + n - 5, ".part");
+}
+
+static int remove_parts(const char *dir, int *n_removed)
+{
+    char path[1400];
+    DIR *d = opendir(dir);
+    if (!d)
+        return errno == ENOENT ? 0 : -errno;
+    int n = 0;
+    for (const struct dirent *e; (e = readdir(d));)
+        if (is_part(e->d_name)) {
+            join(path, sizeof(path), dir, e->d_name);
+            n += unlink(path) == 0;
+        }
+    closedir(d);
+    *n_removed += n;
+    return n ? sync_folder(dir) : 0;
+}
+
 static void remove_new(const char *dir)
 {
     char path[1024];
+    int n = 0;
+    remove_parts(dir, &n);
     join(path, sizeof(path), dir, "take.json");
     unlink(path);
     for (int i = N_FOLDERS - 1; i >= 0; i--) {
@@ -503,30 +528,20 @@ int ledger_create(const char *text, const char *id, const char *takes_dir)
     return err;
 }
 
-// ---- after a crash -------------------------------------------------------------------------------------------------------------------
-
-static bool is_part(const char *name)
+void ledger_remove_leftovers(const char *takes_dir)
 {
-    const size_t n = strlen(name);
-    return name[0] == '.' && n > 6 && !strcmp(name + n - 5, ".part");
-}
-
-static int remove_parts(const char *dir, int *n_removed)
-{
-    char path[1400];
-    DIR *d = opendir(dir);
-    if (!d)
-        return errno == ENOENT ? 0 : -errno;
-    int n = 0;
-    for (const struct dirent *e; (e = readdir(d));)
-        if (is_part(e->d_name)) {
-            join(path, sizeof(path), dir, e->d_name);
-            n += unlink(path) == 0;
+    char path[1024];
+    DIR *d = opendir(takes_dir);
+    for (const struct dirent *e; d && (e = readdir(d));)
+        if (e->d_name[0] == '.' && is_part(e->d_name)) {
+            join(path, sizeof(path), takes_dir, e->d_name);
+            remove_new(path); // only what ledger_create makes; a folder with anything else in it stays
         }
-    closedir(d);
-    *n_removed += n;
-    return n ? sync_folder(dir) : 0;
+    if (d)
+        closedir(d);
 }
+
+// ---- after a crash -------------------------------------------------------------------------------------------------------------------
 
 // Never deleted: somebody may want to know what happened to it.
 static int set_aside(const char *path)
@@ -596,7 +611,7 @@ int ledger_reconcile(struct ledger *l, const char *take_dir, struct ledger_findi
     join(path, sizeof(path), take_dir, "raw");
     DIR *d = err ? NULL : opendir(path);
     for (const struct dirent *e; d && (e = readdir(d));) {
-        bool known = e->d_name[0] == '.' || strstr(e->d_name, ".damaged");
+        bool known = e->d_name[0] == '.' || is_part(e->d_name) || strstr(e->d_name, ".damaged");
         for (int i = 0; i < l->n_cameras && !known; i++)
             for (int k = 0; k < l->camera[i].n_objects && !known; k++)
                 known = !strcmp(l->camera[i].object[k].file + 4, e->d_name);

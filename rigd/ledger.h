@@ -82,6 +82,7 @@ int ledger_parse(struct ledger *out, const char *text, size_t n_bytes, const cha
 // Create takes_dir/id with raw/, thumbnails/, linear/ and geometry/cameras/ and its first ledger, whole and durable or not at all.
 // -EEXIST if there is one. 0 or -errno (logged).
 int ledger_create(const char *text, const char *id, const char *takes_dir);
+void ledger_remove_leftovers(const char *takes_dir); // of creations that a crash ended; for the start of the daemon
 
 // Bring ledger and disk together after a crash: remove *.part, hash frames that are here but not yet noted (they become COPIED),
 // take back COPIED notes whose file is missing, short or different (the copy is set aside as <name>.damaged, never deleted).

@@ -32,7 +32,7 @@ struct files {
     struct file *file;
 };
 
-static const char *const ignored[] = { ".DS_Store", "ascmhl", "ascmhl/", "take.json", ".*.part" };
+static const char *const ignored[] = { ".DS_Store", "ascmhl", "ascmhl/", "take.json", "*.part" };
 
 static void files_free(struct files *f)
 {
@@ -82,7 +82,8 @@ static int walk(struct files *f, const char *dir, const char *relative, int dept
     for (const struct dirent *e; !err && (e = readdir(d));) {
         struct stat st;
         char *name = NULL;
-        if (e->d_name[0] == '.' || (!relative[0] && (!strcmp(e->d_name, "ascmhl") || !strcmp(e->d_name, "take.json"))))
+        const size_t length = strlen(e->d_name);
+        if (e->d_name[0] == '.' || (length > 5 && !strcmp(e->d_name + length - 5, ".part")) || (!relative[0] && (!strcmp(e->d_name, "ascmhl") || !strcmp(e->d_name, "take.json"))))
             continue;
         if (asprintf(&name, "%s%s%s", relative, relative[0] ? "/" : "", e->d_name) < 0) {
             err = -ENOMEM;

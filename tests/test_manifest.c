@@ -37,6 +37,7 @@ static void set_up(void)
     put("raw/A01.nef", "one");
     put("raw/A02 & <b>.nef", "two");
     put("raw/.A03.nef.abc.part", "half");
+    put("raw/A03.nef.part", "half");
 }
 
 static void tear_down(void)
