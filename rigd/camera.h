@@ -133,7 +133,7 @@ struct camera_event {
     struct camera_status status;
     int n_settings;
     struct camera_setting_found setting[CAMERA_SETTINGS_MAX];
-    int n_objects;                     // DRAIN, COLLECT: announced; LIST: on the cards
+    int n_objects;                     // DRAIN, COLLECT: announced; LIST: looked at
     int64_t pressed_ns;                // TRIGGER
     int n_listed;                      // LIST: in object[], in DCF order
     bool more;                         // LIST: there are newer ones than listed

@@ -646,7 +646,8 @@ int gphoto_open(struct gphoto *g, const struct camera_command *c, const struct p
     g->personality = personality;
     if (find_port(g, c->port, c->reset, e))
         return -1;
-    snprintf(g->abilities.model, sizeof(g->abilities.model), "%s", c->model[0] ? c->model : g->usb ? "USB PTP Class Camera" : "PTP/IP Camera");
+    const char *model = c->model[0] ? c->model : g->usb ? "USB PTP Class Camera" : "PTP/IP Camera";
+    snprintf(g->abilities.model, sizeof(g->abilities.model), "%s", model);
     if (!find_driver(g->abilities.library, sizeof(g->abilities.library)))
         return gphoto_fail(e, CAMERA_BROKEN, -ENOENT, "libgphoto2's driver ptp2 is not at %.80s: install libgphoto2-6, or set CAMLIBS",
                            g->abilities.library);
@@ -666,7 +667,8 @@ int gphoto_open(struct gphoto *g, const struct camera_command *c, const struct p
             break;
     }
     if (got >= 0 && c->serial[0] && !is_serial(c->serial, e->facts.serial))
-        got = gphoto_fail(e, CAMERA_WRONG, 0, "the body at %.40s has serial number %s, expected %s: plug in the right one, or change the configuration",
+        got = gphoto_fail(e, CAMERA_WRONG, 0,
+                          "the body at %.40s has serial number %s, expected %s: plug in the right one, or change the configuration",
                           c->port, e->facts.serial[0] ? e->facts.serial : "(none)", c->serial);
     if (got >= 0)
         got = ask_body_once(g, "model", e->facts.model, sizeof(e->facts.model), e);
@@ -725,7 +727,9 @@ static bool set_widget(struct gphoto *g, CameraWidget *w, const char *setting, c
 
 static const char not_offered[] = "not offered";
 
-static int read_found(struct gphoto *g, struct camera_setting_found *f, CameraWidget **w, char driver[PERSONALITY_NAME], struct camera_event *e)
+// 1: the widget is the caller's; 0: the body has no such setting now; < 0: trouble.
+static int read_found(struct gphoto *g, struct camera_setting_found *f, CameraWidget **w, char driver[PERSONALITY_NAME],
+                      struct camera_event *e)
 {
     char text[sizeof(f->found)];
     const int got = get_setting(g, f->name, driver, w, e);
@@ -1276,8 +1280,8 @@ int gphoto_delete(struct gphoto *g, const struct camera_object *o, struct camera
     if (size < 0)
         return -1;
     if (o->size_bytes > 0 && size != o->size_bytes)
-        return gphoto_fail(e, CAMERA_CARD, -ESTALE, "%s on its card has %lld bytes, the copy %lld: it is left there", o->name, (long long)size,
-                           (long long)o->size_bytes);
+        return gphoto_fail(e, CAMERA_CARD, -ESTALE, "%s on its card has %lld bytes, the copy %lld: it is left there", o->name,
+                           (long long)size, (long long)o->size_bytes);
     const int64_t began = begin(g);
     const int code = gp_camera_file_delete(g->camera, o->folder, o->name, g->context);
     if (code < 0)

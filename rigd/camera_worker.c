@@ -192,12 +192,14 @@ static int copy_object(struct worker *w)
     err = container_check(ingest_fd(copy.ingest), copy.size, preview ? "preview.jpg" : c->object.name, why, sizeof(why));
     if (err) {
         ingest_abort(copy.ingest);
-        return err != -EBADMSG ? disk_trouble(e, err, c->path)
-                               : gphoto_fail(e, CAMERA_CORRUPT, 0, "%s is damaged: %s: it stays on the card and is fetched again", c->object.name, why);
+        if (err != -EBADMSG)
+            return disk_trouble(e, err, c->path);
+        return gphoto_fail(e, CAMERA_CORRUPT, 0, "%s is damaged: %s: it stays on the card and is fetched again", c->object.name, why);
     }
     err = ingest_finish(copy.ingest, e->xxh128, &e->size_bytes);
     if (err == -EBADMSG)
-        return gphoto_fail(e, CAMERA_CORRUPT, 0, "%.100s read back differently than it was written: check that disk and the memory", c->path);
+        return gphoto_fail(e, CAMERA_CORRUPT, 0, "%.100s read back differently than it was written: check that disk and the memory",
+                           c->path);
     return err ? disk_trouble(e, err, c->path) : 0;
 }
 
@@ -211,7 +213,8 @@ static int delete_object(struct worker *w)
         return gphoto_fail(e, CAMERA_REFUSED, -EINVAL, "%s: without the hash of its copy nothing is deleted", c->object.name);
     const int err = digest_file(c->path, 1, hex, &size);
     if (err)
-        return gphoto_fail(e, CAMERA_DISK, err, "%s stays on the card: its copy %.80s cannot be read: %s", c->object.name, c->path, strerror(-err));
+        return gphoto_fail(e, CAMERA_DISK, err, "%s stays on the card: its copy %.80s cannot be read: %s", c->object.name, c->path,
+                           strerror(-err));
     if (strcmp(hex, c->xxh128))
         return gphoto_fail(e, CAMERA_CORRUPT, 0, "%s stays on the card: its copy %.80s is not what it was", c->object.name, c->path);
     struct camera_object o = c->object;
@@ -231,7 +234,8 @@ static int open_camera(struct worker *w)
         w->personality_path[0] = 0;
         const int err = c->personality[0] ? personality_read(&w->personality, c->personality) : 0;
         if (err)
-            return gphoto_fail(&w->answer, CAMERA_REFUSED, err, "cannot use the personality %.120s: the journal says which line", c->personality);
+            return gphoto_fail(&w->answer, CAMERA_REFUSED, err, "cannot use the personality %.120s: the journal says which line",
+                               c->personality);
         strcpy(w->personality_path, c->personality);
     }
     return gphoto_open(w->camera, c, w->personality, &w->answer);
@@ -321,6 +325,7 @@ int main(int argc, char **argv)
         say(&w.answer);
         gphoto_rest(w.camera);
     }
-    gphoto_close(w.camera); // a farewell, as the daemon closed its end in peace
+    gphoto_free(w.camera); // a farewell, as the daemon closed its end in peace
+    personality_free(w.personality);
     return 0;
 }
