@@ -22,6 +22,8 @@ enum {
 };
 static const double least_share = .03;       // a smaller region is dissolved: what borders and rims look like, mostly
 static const double worth_a_region = 1.10;   // squared error of views set aside, of one reflectance for two regions
+static const double worth_a_doubtful_one = 1.5; // the same where no parameter is known to differ: a fifth of the RMSE
+static const double certain = 3;             // standard deviations by which a parameter is known to differ
 static const double worth_a_parameter = .97; // the same with a parameter free per texel
 static const double worth_a_layer = 1.01;    // the same without clearcoat, sheen, ...
 static const double better_without = .99;
@@ -675,6 +677,18 @@ static double how_much_worse(const float *shared, const float *alone, int n)
     return exp(mean - 4 * sqrt(variance));
 }
 
+// Does some parameter of the two differ by more than is not known of it?
+static bool known_to_differ(const struct region *a, const struct region *b)
+{
+    for (int p = 0; p < DISNEY_N; p++) {
+        const int at = packed_at(p, p);
+        const double d = (double)(a->theta[p] - b->theta[p]), std = (double)unknown_misfit * sqrt(a->covariance[at] + b->covariance[at]);
+        if (fabs(d) > certain * std)
+            return true;
+    }
+    return false;
+}
+
 // As many of either.
 static void call_both(const struct witnesses *a, const struct witnesses *b, struct witnesses *both)
 {
@@ -687,8 +701,8 @@ static void call_both(const struct witnesses *a, const struct witnesses *b, stru
     }
 }
 
-// Two regions are one as long as both do as well under one reflectance: no worse than by a tenth of the squared error, or by what a
-// reflectance of their own takes up of anything. Where the lights are wrong every piece of the surface does better by itself, in views set
+// Two regions are one as long as both do as well under one reflectance: no worse than by a tenth of the squared error, by half of it while no
+// parameter is known to differ, or by what a reflectance of their own takes up of anything. Where the lights are wrong every piece of the surface does better by itself, in views set
 // aside too, which share the lights' error; what is left of the pictures under a theta of its own says how much of that there is.
 static int merge(struct search *s)
 {
@@ -705,7 +719,7 @@ static int merge(struct search *s)
             err = test(s, &w[r], s->out->region[r].theta, 0, -1, &error2, NULL, alone[r]);
             if (!err)
                 err = region_uncertainty(s, &s->inner, &w[r], 0, &s->out->region[r], &leeway);
-            most_worse[r] = fmax(worth_a_region, 1 + leeway);
+            most_worse[r] = 1 + (double)(unknown_misfit * unknown_misfit) * leeway;
         }
         for (int a = 0; !err && a < s->out->n; a++)
             for (int b = a + 1; !err && b < s->out->n; b++) {
@@ -722,9 +736,10 @@ static int merge(struct search *s)
                 if (err)
                     break;
                 const double worse_a = how_much_worse(one, alone[a], w[a].n), worse_b = how_much_worse(other, alone[b], w[b].n);
-                const double worse = fmax(worse_a / most_worse[a], worse_b / most_worse[b]);
+                const double least_allowed = known_to_differ(&s->out->region[a], &s->out->region[b]) ? worth_a_region : worth_a_doubtful_one;
+                const double worse = fmax(worse_a / fmax(most_worse[a], least_allowed), worse_b / fmax(most_worse[b], least_allowed));
                 log_debug("regions: %d and %d of %d as one: views aside %.4f x, %.4f x; allowed %.4f, %.4f", a, b, s->out->n, worse_a, worse_b,
-                          most_worse[a], most_worse[b]);
+                          fmax(most_worse[a], least_allowed), fmax(most_worse[b], least_allowed));
                 if (worse < least) {
                     least = worse, best_a = a, best_b = b;
                     memcpy(best_theta, theta, sizeof(theta));
