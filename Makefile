@@ -34,7 +34,7 @@ endif
 TAKE := $(addprefix solver/take/,atomic_file.c image.c image_exr.c image_hdr.c image_jpeg.c image_png.c image_tiff.c json.c log.c progress.c take.c)
 SOLVER := $(addprefix solver/,alternating.c cameras.c cameras_bundler.c cameras_colmap.c cameras_format.c cameras_frame.c \
   cameras_meshroom.c cameras_metashape.c cameras_realitycapture.c compare.c csv.c disney.c emitters.c export.c export_glb.c \
-  export_materialx.c export_obj.c gltf_brdf.c interreflection.c joint.c levels.c lights.c lm.c materials.c mesh.c mesh_gltf_floats.c mesh_import.c misfit.c normal_equations.c \
+  export_materialx.c export_obj.c gltf_brdf.c interreflection.c joint.c levels.c lights.c lm.c materials.c mesh.c mesh_gltf_floats.c mesh_import.c mirrored.c misfit.c normal_equations.c \
   orientation.c panorama.c parallel.c pcg.c photometric.c picture_size.c rays.c regions.c relocate.c render.c report.c samples.c shapes.c stage1.c synth.c \
   texel_fit.c texels.c visibility.c xml.c)
 KERNELS := $(addprefix solver/kernels/,kernels.c kernels_ref.c kernels_portable.c kernels_avx2.c kernels_avx512.c)
@@ -44,7 +44,7 @@ FUZZED := $(TAKE) $(addprefix solver/,cameras.c cameras_bundler.c cameras_colmap
   cameras_metashape.c cameras_realitycapture.c csv.c lights.c mesh.c mesh_gltf_floats.c mesh_import.c orientation.c panorama.c parallel.c \
   picture_size.c texels.c xml.c)
 TESTS := $(addprefix test_,alternating brdf cameras cameras_import compare csv disney emitters export gltf_brdf image interreflection joint json judge levels \
-  lights lm materials mesh misfit normal_equations orientation panorama parallel pcg photometric rays render report samples shapes stability \
+  lights lm materials mesh mirrored misfit normal_equations orientation panorama parallel pcg photometric rays relocate render report samples shapes stability \
   synth take texels vec3 visibility) check_kernels
 FUZZERS := cameras cameras_import csv exr hdr json lights mesh
 
