@@ -199,6 +199,29 @@ static void what_does_not_help_is_not_taken(void **unused)
     free(kept);
 }
 
+static void doubts_are_asked_again_under_the_materials_but_for_those_that_none_can_lift(void **unused)
+{
+    (void)unused;
+    const struct joint_settings set = settings(0);
+    const unsigned stays = DOUBT_MIRRORED;
+    struct joint_result r = { .doubts = stays | DOUBT_UNCERTAIN | DOUBT_POOR_FIT, .inverse_distance_std = calloc((size_t)truth.n, sizeof(double)) };
+    float(*theta)[DISNEY_N] = calloc((size_t)studio.texels.n, sizeof(*theta));
+    for (int t = 0; t < studio.texels.n; t++) // a rough metal
+        theta[t][DISNEY_METALLIC] = theta[t][DISNEY_ROUGHNESS] = .9f;
+    start_at(&r.state, right, nothing);
+    assert_int_equal(relocate_doubt(&r, &studio.texels, &studio.samples, studio.rays, studio.held_out, (const float(*)[DISNEY_N])true_theta, NULL, &set), 0);
+    print_message("# under the true material: structure %.4f of %.3f, distances' deviation %.1f %%, centre's %.2f cm\n", r.misfit.structure, r.misfit.level,
+                  100 * r.distance_std_relative, 100 * vec3_norm(r.centre_std_m));
+    assert_int_equal(r.doubts, stays);
+    assert_true(r.distance_std_relative > 0 && vec3_norm(r.centre_std_m) > 0);
+    assert_int_equal(relocate_doubt(&r, &studio.texels, &studio.samples, studio.rays, studio.held_out, (const float(*)[DISNEY_N])theta, NULL, &set), 0);
+    assert_true(r.doubts & DOUBT_POOR_FIT);
+    assert_true(r.doubts & stays);
+    assert_true(fabs(distance_error(&r.state)) < 1e-12); // looked at, not moved
+    joint_result_free(&r);
+    free(theta);
+}
+
 static void held_out_views_are_not_looked_at_and_threads_do_not_matter(void **unused)
 {
     (void)unused;
@@ -227,6 +250,7 @@ int main(void)
         cmocka_unit_test(lights_come_nearer_to_the_truth_and_their_groups_keep_together),
         cmocka_unit_test(the_start_does_not_matter_but_the_materials_do),
         cmocka_unit_test(what_does_not_help_is_not_taken),
+        cmocka_unit_test(doubts_are_asked_again_under_the_materials_but_for_those_that_none_can_lift),
         cmocka_unit_test(held_out_views_are_not_looked_at_and_threads_do_not_matter),
     };
     return cmocka_run_group_tests_name("relocate", tests, open_studio, close_studio);

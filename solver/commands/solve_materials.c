@@ -2,6 +2,7 @@
 #include "solver/commands/solve_materials.h"
 
 #include "solver/commands/arguments.h"
+#include "solver/mirrored.h"
 #include "solver/relocate.h"
 #include "solver/take/image.h"
 #include "solver/take/log.h"
@@ -221,6 +222,15 @@ static bool is_glossy(const struct materials *m)
     return (float)n > glossy_share * (float)m->n_texels;
 }
 
+// Glossy, or metal: it shows a picture of its surroundings.
+static bool is_mirroring(const struct materials *m)
+{
+    int n = 0;
+    for (int t = 0; t < m->n_texels; t++)
+        n += m->theta[t][DISNEY_METALLIC] > .5f;
+    return (float)n > glossy_share * (float)m->n_texels || is_glossy(m);
+}
+
 // The lights' regions once more in parts, at their distances: in `lights` and in stage1.
 static int cut_finer(struct joint_result *stage1, struct lights *lights, const struct inputs *in, int n)
 {
@@ -252,6 +262,37 @@ static int cut_finer(struct joint_result *stage1, struct lights *lights, const s
     return 0;
 }
 
+// ---- the object in its own gloss ------------------------------------------------------------------------------------------
+
+enum { MIRROR_RAYS = 16 };
+
+// The materials once more, from samples without what the object mirrors of itself under those found so far.
+static int solve_without_mirrored(struct materials *m, struct samples *without, const struct materials_input *input, const struct inputs *in,
+                                  const struct materials_settings *set)
+{
+    const struct mirrored mirrored = { .texels = input->texels, .mesh = input->mesh, .rays = in->rays, .lights = input->lights, .samples = input->samples,
+                                       .visible = input->visible, .soft = input->soft, .words_per_texel = input->words_per_texel,
+                                       .theta = (const float(*)[DISNEY_N])m->theta, .albedo = (const float(*)[3])m->albedo,
+                                       .indirect = (const float(*)[3])m->indirect, .variant = set->variant, .n_rays = MIRROR_RAYS, .n_threads = set->n_threads };
+    struct materials_input again = *input;
+    struct materials better;
+    float(*radiance)[3] = calloc((size_t)input->samples->n + 1, sizeof(*radiance));
+    int err = radiance ? mirrored_gather(&mirrored, radiance) : -ENOMEM;
+    if (!err)
+        err = mirrored_take_off(without, input->samples, (const float(*)[3])radiance);
+    free(radiance);
+    if (err)
+        return err;
+    again.samples = without;
+    err = materials_solve(&better, &again, set);
+    if (err)
+        return err;
+    log_debug("materials: without what the object mirrors of itself: held out %.3f -> %.3f %%", m->rmse_held_out_percent, better.rmse_held_out_percent);
+    materials_free(m);
+    *m = better;
+    return 0;
+}
+
 // ---- the stage ----------------------------------------------------------------------------------------------------------
 
 static int trace(struct materials_input *input, struct light_visibility *v, const struct inputs *in, int n_threads)
@@ -267,6 +308,7 @@ int solve_find_materials(struct materials *out, const struct solve_materials *se
                          int n_threads)
 {
     struct light_visibility visibility = { 0 };
+    struct samples without = { 0 }; // what the object mirrors of itself
     const enum method method = joint->method;
     const int n_relocations = set->n_relocations >= 0 ? set->n_relocations : set->lights_from || method != METHOD_JOINT ? 0 : 2;
     struct materials_settings settings = method == METHOD_JOINT ? materials_defaults() : materials_paper();
@@ -313,11 +355,14 @@ int solve_find_materials(struct materials *out, const struct solve_materials *se
         err = trace(&input, &visibility, in, n_threads);
     if (!err)
         err = materials_solve(out, &input, &settings);
+    if (!err && settings.n_bounces > 0 && is_mirroring(out))
+        err = solve_without_mirrored(out, &without, &input, in, &settings);
     if (!err && n_relocations > 0)
-        err = relocate_doubt(stage1, &in->texels, samples, in->rays, held_out, (const float(*)[DISNEY_N])out->theta, (const float(*)[3])out->indirect, joint);
+        err = relocate_doubt(stage1, &in->texels, without.radiance ? &without : samples, in->rays, held_out, (const float(*)[DISNEY_N])out->theta, (const float(*)[3])out->indirect, joint);
     if (err)
         materials_free(out);
     light_visibility_free(&visibility);
+    free(without.radiance);
     return err;
 }
 
