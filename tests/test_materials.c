@@ -181,6 +181,57 @@ static void gradient_of_a_texel_is_the_derivative_of_its_cost(void **state)
     }
 }
 
+// Shares of 0 and 1 are bits; where less of the lights arrives, what is seen takes a brighter albedo; light from elsewhere a darker one.
+static void soft_shadows_and_light_from_the_object_count_as_light(void **state)
+{
+    (void)state;
+    struct materials_input in = input_of(&d5);
+    struct materials_settings set = materials_defaults();
+    const size_t n = (size_t)d5.texels.n, n_lights = (size_t)d5.truth.lights.n;
+    static const float theta[DISNEY_N] = { .1f, .2f, .4f, .5f, 0, 0, 0, 0, .2f, .4f };
+    uint8_t *soft = malloc(n * n_lights);
+    float(*indirect)[3] = malloc(n * sizeof(*indirect));
+    struct estimate e;
+    set.n_threads = 1;
+    for (size_t t = 0; t < n; t++) {
+        for (size_t i = 0; i < n_lights; i++)
+            soft[t * n_lights + i] = d5.visibility.bits[t * (size_t)d5.visibility.words_per_texel + i / 16] >> i % 16 & 1 ? 255 : 0;
+        indirect[t][0] = indirect[t][1] = indirect[t][2] = t % 2 ? .2f : .1f;
+    }
+    int n_seen = 0, n_shadowed = 0, n_brighter = 0, n_darker = 0;
+    for (int t = 0; t < d5.texels.n; t += 97) {
+        float albedo[5][3];
+        double cost[5];
+        for (int k = 0; k < 5; k++) { // bits, the same as bytes, four fifths of them, light from the object, everything lit
+            struct texel_sums sums = { 0 };
+            uint8_t *own = soft + (size_t)t * n_lights;
+            in.visible = k < 4 ? d5.visibility.bits : NULL;
+            in.soft = k == 1 || k == 2 ? soft : NULL;
+            assert_int_equal(estimate_new(&e, &in, &set), 0);
+            e.scene.indirect = k == 3 ? (const float(*)[3])indirect : NULL;
+            for (size_t i = 0; k == 2 && i < n_lights; i++)
+                own[i] = (uint8_t)(own[i] * 4 / 5);
+            for (int c = 0; c < 3; c++)
+                albedo[k][c] = .3f;
+            texel_fit(&e.scene, e.worker[0], t, 0, theta, albedo[k], 1, &sums);
+            cost[k] = sums.cost;
+            e.scene.indirect = NULL;
+            estimate_free(&e);
+        }
+        if (!(albedo[0][0] > .02f && albedo[0][0] < 1))
+            continue;
+        n_seen++;
+        n_shadowed += albedo[4][0] < .98f * albedo[0][0];
+        for (int c = 0; c < 3; c++) // 255 x (1 / 255) rounds
+            assert_true(fabsf(albedo[1][c] - albedo[0][c]) < 1e-5f);
+        assert_true(fabs(cost[0] - cost[1]) < 1e-4 * cost[0] + 1e-7);
+        n_brighter += albedo[2][0] > 1.2f * albedo[0][0]; // not where the camera clipped
+        n_darker += albedo[3][0] < albedo[0][0] - .01f;
+    }
+    assert_true(n_seen > 10 && n_shadowed > 2 && n_brighter > .8 * n_seen && n_darker > .8 * n_seen);
+    free(soft), free(indirect);
+}
+
 // One step of a level of few texels: PCG's answer against all unknowns in one dense matrix, built from blocks, edges and parents.
 static void a_step_by_pcg_is_that_of_the_dense_system(void **state)
 {
@@ -562,6 +613,7 @@ int main(void)
     const struct CMUnitTest tests[] = {
         cmocka_unit_test(packed_cholesky_solves),
         cmocka_unit_test(gradient_of_a_texel_is_the_derivative_of_its_cost),
+        cmocka_unit_test(soft_shadows_and_light_from_the_object_count_as_light),
         cmocka_unit_test(a_step_by_pcg_is_that_of_the_dense_system),
         cmocka_unit_test(one_material_stays_one_and_is_found),
         cmocka_unit_test(lights_that_are_off_make_no_second_material),
