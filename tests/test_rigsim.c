@@ -46,7 +46,7 @@ struct rig {
 static void rig_open(struct rig *r, const char *personality, unsigned index, uint64_t seed, const char *folder)
 {
     memset(r, 0, sizeof(*r));
-    assert_int_equal(personality_read(&r->personality, personality), 0);
+    assert_int_equal(personality_load(&r->personality, personality), 0);
     assert_int_equal(scene_open(&r->scene, folder, WIDTH, HEIGHT, 3, name_of), 0);
     assert_int_equal(body_init(&r->body, &r->personality, index, seed, S, 1767225600 * S), 0);
     r->body.measure = frame_measure;
@@ -189,7 +189,7 @@ static void a_file_changes_what_it_names(void **state)
                                "property 0x5007 u16 rw aperture.100 enum 800,1100 = 1100\n";
     struct personality p;
     scratch_write("d850.conf", text, sizeof(text) - 1);
-    assert_int_equal(personality_read(&p, scratch_path("d850.conf")), 0);
+    assert_int_equal(personality_load(&p, scratch_path("d850.conf")), 0);
     assert_string_equal(p.model, "D850");
     assert_int_equal(p.vendor, VENDOR_NIKON);
     assert_true(p.lag_ms == 42.5 && p.wb[2] == .8);
@@ -221,7 +221,7 @@ static void a_wrong_statement_is_named_by_file_and_line(void **state)
     for (size_t i = 0; i < sizeof(bad) / sizeof(bad[0]); i++) {
         struct personality p;
         scratch_write("bad.conf", bad[i].text, strlen(bad[i].text));
-        assert_int_equal(personality_read(&p, scratch_path("bad.conf")), -EINVAL);
+        assert_int_equal(personality_load(&p, scratch_path("bad.conf")), -EINVAL);
         assert_non_null(strstr(last_log, bad[i].found));
     }
     scratch_empty();

@@ -6,6 +6,7 @@
 #include "solver/take/atomic_file.h"
 #include "solver/take/log.h"
 #include "solver/take/take.h"
+#include "solver/texels.h"
 #include "solver/vec3.h"
 #include "tests/truth.h"
 

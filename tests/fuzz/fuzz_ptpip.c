@@ -43,7 +43,7 @@ int LLVMFuzzerTestOneInput(const uint8_t *data, size_t size)
     if (size < 1)
         return 0;
     const int which = data[0] % 3;
-    if (!personality[which].n_properties && personality_read(&personality[which], name[which]))
+    if (!personality[which].n_properties && personality_load(&personality[which], name[which]))
         abort();
     if (body_init(&body, &personality[which], 0, 0, 1, 1))
         return 0;

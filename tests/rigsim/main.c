@@ -148,7 +148,7 @@ int main(int argc, char **argv)
     argp_err_exit_status = 2;
     log_set_program("rigsim");
     argp_parse(&parser, argc, argv, 0, NULL, &a);
-    int err = p ? personality_read(p, a.personality) : -ENOMEM;
+    int err = p ? personality_load(p, a.personality) : -ENOMEM;
     for (int i = 0; !err && i < a.n_set; i++)
         err = personality_statement(p, a.set[i], "--set", i + 1);
     if (!err && a.faults)

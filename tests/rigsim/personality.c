@@ -388,7 +388,7 @@ const struct property *personality_property(const struct personality *p, uint16_
     return NULL;
 }
 
-int personality_read(struct personality *out, const char *name)
+int personality_load(struct personality *out, const char *name)
 {
     struct personality *p = calloc(1, sizeof(*p));
     char *text = NULL;

@@ -97,7 +97,7 @@ struct personality {
 
 // name: generic, nikon, canon, or a file. Errors, logged with file, line, what was found and what is accepted: -EINVAL, -errno of the
 // open, -EFBIG.
-int personality_read(struct personality *out, const char *name);
+int personality_load(struct personality *out, const char *name);
 // One more statement, e.g. "lag_jitter_ms = 3" (rigsim --set). name_for_errors and line go into the message.
 int personality_statement(struct personality *p, const char *text, const char *name_for_errors, int line);
 // The text of a built-in one, to begin a file with; NULL if there is none of that name.
