@@ -299,7 +299,7 @@ static void lights_that_are_off_make_no_second_material(void **state)
 {
     (void)state;
     for (uint64_t seed = 1; seed <= 3; seed++)
-        assert_int_equal(n_regions_under_lights_off(&noiseless, seed == 3 ? .03 : .12, seed), 1);
+        assert_int_equal(n_regions_under_lights_off(&noiseless, .08, seed), 1);
 }
 
 static void lights_that_are_off_hide_no_material(void **state)
