@@ -145,7 +145,7 @@ fuzz: deps deps-fuzz $(FUZZ_PROGRAMS)
 	@printf '%s\n' $(FUZZ_PROGRAMS) | xargs -P 2 -I{} sh tests/fuzz/run.sh {} $(FUZZ_SECONDS)
 
 # ---- demonstration, measurements ------------------------------------------------------------------------------------------
-demo: deps $(BUILD)/bin/rigsolve
+demo: deps all
 	@BIN=$(BUILD)/bin sh tests/demo.sh build/demo
 
 HAVE_CERES := $(wildcard /usr/include/ceres/jet.h)
