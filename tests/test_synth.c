@@ -611,7 +611,7 @@ static void own_objects_are_scaled_centred_and_painted(void **state)
                 assert_true(fabs((double)brdf.data[DISNEY_N * at + (size_t)image_channel(&brdf, disney_parameter_names[k])] - expected) < 1e-5);
             }
         }
-        assert_true(n[0] > 20 && n[1] > 20);
+        assert_true(n[flipped] > 20 && n[!flipped] == 0); // the pebble's atlas leaves the top of its square empty
         image_free(&albedo), image_free(&brdf), texels_free(&texels), mesh_free(&mesh);
     }
     s.mesh_path = NULL;
