@@ -263,6 +263,7 @@ static gboolean reap_again(gpointer arg)
     pthread_mutex_unlock(&r->c->lock);
     if (result == -EAGAIN && r->blocks && umockdev_ioctl_client_get_connected(r->client))
         return G_SOURCE_CONTINUE;
+    g_object_set_data(G_OBJECT(r->client), "reaped", result ? NULL : r->client);
     complete(r->client, result);
     return G_SOURCE_REMOVE;
 }
@@ -287,18 +288,15 @@ static bool reap_later(struct usb_camera *c, UMockdevIoctlClient *client, bool b
     return true;
 }
 
-// usbfs drops what a program leaves behind.
-static void on_closed(UMockdevIoctlClient *client, GParamSpec *ignored, gpointer arg)
+// usbfs drops what a program leaves behind. A client ends when its program closes the node or dies, in whatever request.
+static void on_gone(gpointer arg, GObject *client)
 {
     struct usb_camera *c = arg;
-    (void)ignored;
-    if (umockdev_ioctl_client_get_connected(client))
-        return;
     pthread_mutex_lock(&c->lock);
     for (int i = c->n_urbs - 1; i >= 0; i--)
-        if (c->urb[i].client == client)
+        if ((GObject *)c->urb[i].client == client)
             drop_urb(c, i);
-    if (c->claimed_by == client)
+    if ((GObject *)c->claimed_by == client)
         c->claimed_by = NULL;
     pthread_mutex_unlock(&c->lock);
 }
@@ -306,7 +304,7 @@ static void on_closed(UMockdevIoctlClient *client, GParamSpec *ignored, gpointer
 static void on_connected(UMockdevIoctlBase *handler, UMockdevIoctlClient *client, gpointer arg)
 {
     (void)handler;
-    g_signal_connect(client, "notify::connected", G_CALLBACK(on_closed), arg);
+    g_object_weak_ref(G_OBJECT(client), on_gone, arg);
 }
 
 static void bus_reset(struct usb_camera *c)
@@ -378,7 +376,11 @@ static gboolean on_request(UMockdevIoctlBase *handler, UMockdevIoctlClient *clie
     pthread_mutex_lock(&c->lock);
     const int result = reaps ? reap(c, client) : handle(c, client, umockdev_ioctl_client_get_arg(client));
     pthread_mutex_unlock(&c->lock);
-    if (!reaps || result != -EAGAIN || !reap_later(c, client, request == USBDEVFS_REAPURB))
+    // libusb reaps until there is nothing more, then polls: only what follows a poll() waits.
+    const bool has_polled = !g_object_get_data(G_OBJECT(client), "reaped");
+    if (reaps)
+        g_object_set_data(G_OBJECT(client), "reaped", result ? NULL : client);
+    if (!reaps || result != -EAGAIN || !(has_polled || request == USBDEVFS_REAPURB) || !reap_later(c, client, request == USBDEVFS_REAPURB))
         complete(client, result);
     return TRUE;
 }
