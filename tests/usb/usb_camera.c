@@ -434,8 +434,9 @@ static int add(UMockdevTestbed *bed, const char *text)
 
 static int add_hub(UMockdevTestbed *bed, const char *path, int number, const char *below)
 {
-    char text[1200], at[300];
-    snprintf(at, sizeof(at), "%s/sys%s", umockdev_testbed_get_root_dir(bed), path);
+    char text[1200], at[300], *sys = umockdev_testbed_get_sys_dir(bed);
+    snprintf(at, sizeof(at), "%s%s", sys, path);
+    g_free(sys);
     if (g_file_test(at, G_FILE_TEST_IS_DIR))
         return 0;
     snprintf(text, sizeof(text),
