@@ -12,7 +12,7 @@ MACHINE := $(shell uname -m)
 
 # ---- packages (Debian 12; the same names in Debian 13) ----------------------------------------------------------------
 PACKAGES := gcc make pkg-config libopenexr-dev libembree-dev libassimp-dev libjansson-dev libtiff-dev libpng-dev libjpeg-dev libexpat1-dev liblapacke-dev libopenblas-dev libcmocka-dev perl help2man \
-  libgphoto2-dev libgpiod-dev libinih-dev libsystemd-dev libxxhash-dev
+  libgphoto2-dev libgpiod-dev libinih-dev libsystemd-dev libumockdev-dev libxxhash-dev
 PACKAGES_FUZZ := clang libclang-rt-dev
 PACKAGES_BENCH := libceres-dev g++ gnuplot-nox
 
@@ -94,7 +94,7 @@ $(BUILD)/bin/rigsim: $(call object,$(filter-out %/client.c,$(RIGSIM))) $(BUILD)/
 	@mkdir -p $(@D)
 	@$(if $(V),,echo '  LD $@')
 	$(Q)$(CC) $(CFLAGS_ALL) $^ $(LIBS) -o $@
-$(BUILD)/librigsim.a: $(call object,$(RIGSIM_LIB) tests/rigsim/client.c)
+$(BUILD)/librigsim.a: $(call object,$(RIGSIM_LIB) tests/rigsim/client.c $(wildcard tests/usb/*.c))
 	@rm -f $@
 	@$(if $(V),,echo '  AR $@')
 	$(Q)ar rcsD $@ $^
@@ -104,6 +104,9 @@ $(BUILD)/tests/%: $(BUILD)/obj/tests/%.o $(BUILD)/librigsim.a $(BUILD)/librig.a 
 	$(Q)$(CC) $(CFLAGS_ALL) -Wl,--as-needed $^ -lcmocka $(LIBS_RIG) $(LIBS) -o $@
 $(BUILD)/tests/test_camera_worker $(BUILD)/tests/test_rigsim_wire: | $(BUILD)/bin/rigd-camera $(BUILD)/bin/rigsim
 $(BUILD)/tests/bench/stability_joint: $(call object,solver/commands/arguments.c)
+$(BUILD)/obj/tests/test_usb_camera.o $(BUILD)/obj/tests/usb/usb_camera.o: CFLAGS_ALL += $(shell pkg-config --cflags umockdev-1.0 2>/dev/null)
+$(BUILD)/tests/test_usb_camera: LIBS += $(shell pkg-config --libs umockdev-1.0 2>/dev/null)
+$(BUILD)/tests/test_usb_camera: | $(BUILD)/bin/rigd-camera
 $(BUILD)/tests/test_pcg: LIBS += $(if $(wildcard /usr/include/suitesparse/cholmod.h),-lcholmod)
 $(BUILD)/fuzz/obj/%.o: %.c Makefile | deps-fuzz
 	@mkdir -p $(@D)
