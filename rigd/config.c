@@ -165,7 +165,7 @@ static void begin_camera(struct reader *r, const char *name)
     r->section = CAMERA;
     r->camera_line[c->n_cameras] = r->line;
     struct config_camera *k = &c->camera[c->n_cameras++];
-    snprintf(k->name, sizeof(k->name), "%s", name);
+    snprintf(k->name, sizeof(k->name), "%.23s", name);
     k->full_line = k->half_line = k->feedback_line = k->relay_line = CONFIG_NONE;
 }
 

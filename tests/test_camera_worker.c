@@ -376,7 +376,7 @@ static void a_lost_event_is_made_up_for_by_the_listing(void **state)
             assert_int_equal(e->n_objects, 0); // time is up, and that is no failure
             e = done(&w, (struct camera_command){ .kind = CAMERA_LIST, .n_objects = 8 });
             assert_int_equal(e->n_listed, shot);
-            char name[16];
+            char name[24];
             snprintf(name, sizeof(name), "A%d.dng", shot);
             done(&w, fetching(CAMERA_FETCH, &w.answer.object[shot - 1], name));
         }
@@ -603,7 +603,7 @@ static void hostile_replies_are_survived_or_kill_only_the_worker(void **state)
     struct sim s;
     struct worker w[N];
     bool alive[N];
-    char script[N * 48] = "", name[16];
+    char script[N * 48] = "", name[24];
     int n_answers = 0;
     for (int i = 0; i < N; i++) {
         const size_t n = strlen(script);
