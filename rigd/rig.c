@@ -881,9 +881,15 @@ static void begin_fire(struct rig *r, int64_t now)
             r->skip[i / 64] |= UINT64_C(1) << i % 64;
         r->body[i].flash_ns = INT64_MIN;
     }
-    if (measured && (r->abilities & TRIGGER_DELAYS) && r->purpose == FOR_TAKE)
-        lag_delays(lag, r->n, MAX_DELAY_US, r->delay_us);
     const uint32_t half_ms = r->abilities & TRIGGER_HALF_PRESS ? t->half_press_ms : 0;
+    if (measured && (r->abilities & TRIGGER_DELAYS) && r->purpose == FOR_TAKE) {
+        const uint32_t held_ms = half_ms + t->hold_ms; // half-press waits for the slowest: delays count towards max_hold_ms
+        const uint32_t room_us = t->max_hold_ms > held_ms ? 1000 * (t->max_hold_ms - held_ms) : 0;
+        const int n_clipped = lag_delays(lag, r->n, room_us < MAX_DELAY_US ? room_us : MAX_DELAY_US, r->delay_us);
+        if (n_clipped)
+            say(r, RIG_WARNING, CONFIG_NONE, "lag of %d cameras is not made up for in full: max_hold_ms = %u leaves %u ms for delays; raise it in rigd.conf", n_clipped, t->max_hold_ms,
+                (room_us < MAX_DELAY_US ? room_us : MAX_DELAY_US) / 1000);
+    }
     struct trigger_shot *shot = &act(r, RIG_FIRE, CONFIG_NONE)->shot;
     r->at_ns = now + (FIRE_LEAD_MS + (int64_t)half_ms) * MS;
     *shot = (struct trigger_shot){ .at_ns = r->at_ns, .half_ms = half_ms, .hold_ms = t->hold_ms, .delay_us = r->delay_us, .skip = r->skip };

@@ -466,6 +466,7 @@ static void obey(const struct rig_action *a)
             later(press, W_PRESS, i, 0);
             w.n_to_open++;
             w.released_ns = release > w.released_ns ? release : w.released_ns;
+            assert_true(a->shot.half_ms + a->shot.delay_us[i] / 1000 + a->shot.hold_ms <= w.config.trigger.max_hold_ms); // it would be refused
         }
         later(w.released_ns - w.now, W_FIRED, -1, a->shot.at_ns);
         break;
@@ -1120,6 +1121,15 @@ static void lag_is_measured_and_compensated(void **state)
     check_accounts(l);
     assert_true(l->sigma_ns < sigma_before * 2 / 3);
     assert_true(l->spread_ns < spread_before);
+    w.config.trigger.max_hold_ms = 510; // leaves 10 ms of the 20 that are needed
+    w.n_said = 0;
+    l = capture_as("20261122T090002_story", false);
+    check_accounts(l);
+    assert_int_equal(l->state, TAKE_VERIFIED);
+    bool told = false;
+    for (int i = 0; i < w.n_said; i++)
+        told |= strstr(w.said[i], "max_hold_ms = 510 leaves 10 ms") != NULL;
+    assert_true(told);
     tear_down();
 }
 
