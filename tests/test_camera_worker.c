@@ -436,6 +436,27 @@ static void what_a_body_does_not_take_is_told_not_hidden(void **state)
     sim_stop(&s);
 }
 
+static void a_body_shows_itself_and_works_on(void **state)
+{
+    (void)state;
+    for (int k = 0; k < 3; k++) {
+        struct sim s;
+        struct worker w;
+        const struct camera_command c = { .kind = CAMERA_IDENTIFY, .timeout_ms = 1000 };
+        sim_start(&s, kinds[k][0], NULL);
+        worker_start(&w);
+        done(&w, opening(&s, kinds[k][1]));
+        if (k)
+            done(&w, c);
+        else
+            fails(&w, c, CAMERA_REFUSED); // it has nothing to show
+        release_shutter(&w); // live view is off again
+        assert_int_equal(done(&w, (struct camera_command){ .kind = CAMERA_COLLECT, .n_objects = 1 })->n_objects, 1);
+        worker_stop(&w);
+        sim_stop(&s);
+    }
+}
+
 static void a_flood_of_events_is_named_and_ends(void **state)
 {
     (void)state;
@@ -670,6 +691,7 @@ int main(void)
         cmocka_unit_test(a_lost_event_is_made_up_for_by_the_listing),
         cmocka_unit_test(the_wrong_body_is_not_used),
         cmocka_unit_test(what_a_body_does_not_take_is_told_not_hidden),
+        cmocka_unit_test(a_body_shows_itself_and_works_on),
         cmocka_unit_test(a_flood_of_events_is_named_and_ends),
         cmocka_unit_test(a_busy_body_is_busy_and_not_bare_of_settings),
         cmocka_unit_test(a_full_card_is_the_card),
