@@ -110,6 +110,7 @@ struct reader {
     uint32_t seen;          // keys of the present section
     uint32_t seen_sections; // except cameras
     int camera_line[CONFIG_CAMERAS_MAX];
+    int trigger_line, hold_line; // of [trigger]; of the last of half_press_ms, hold_ms and max_hold_ms, else of [trigger]
     struct own_setting *own;
     int n_own;
 };
@@ -165,7 +166,7 @@ static void begin_camera(struct reader *r, const char *name)
     r->section = CAMERA;
     r->camera_line[c->n_cameras] = r->line;
     struct config_camera *k = &c->camera[c->n_cameras++];
-    snprintf(k->name, sizeof(k->name), "%s", name);
+    snprintf(k->name, sizeof(k->name), "%.23s", name);
     k->full_line = k->half_line = k->feedback_line = k->relay_line = CONFIG_NONE;
 }
 
@@ -191,6 +192,8 @@ static void begin_section(struct reader *r, const char *name)
     for (int s = RIG; s < CAMERA; s++)
         if (!strcmp(name, sections[s].name)) {
             r->section = s;
+            if (s == TRIGGER)
+                r->trigger_line = r->hold_line = r->line;
             if (r->seen_sections >> s & 1)
                 complain(r, r->line, "section [%s] is there twice; join them", name);
             r->seen_sections |= 1u << s;
@@ -457,6 +460,8 @@ static int take_line(void *arg, const char *section, const char *name, const cha
         if (r->seen >> k & 1)
             complain(r, r->line, "'%s' is there twice in this section; remove one", name);
         r->seen |= 1u << k;
+        if (r->section == TRIGGER && (!strcmp(name, "half_press_ms") || !strcmp(name, "hold_ms") || !strcmp(name, "max_hold_ms")))
+            r->hold_line = r->line;
         const char *expected = set_value(key, target, value);
         if (expected)
             complain(r, r->line, "%s: found '%s', expected %s", name, value, expected);
@@ -519,29 +524,33 @@ static void check_lines(struct reader *r)
     const struct trigger_config *t = &c->trigger;
     struct use *uses = calloc((size_t)c->n_cameras * 4 + 3, sizeof(*uses));
     int n = 0;
+    bool half = t->kind == TRIGGER_SIMULATED || (t->kind != TRIGGER_SOFTWARE && t->half_line != CONFIG_NONE);
     if (!uses) {
         r->no_memory = true;
         return;
     }
-    use_line(r, uses, &n, t->full_line, "", "full_line", 0);
-    use_line(r, uses, &n, t->half_line, "", "half_line", 0);
-    use_line(r, uses, &n, t->button_line, "", "button_line", 0);
+    use_line(r, uses, &n, t->full_line, "", "full_line", r->trigger_line);
+    use_line(r, uses, &n, t->half_line, "", "half_line", r->trigger_line);
+    use_line(r, uses, &n, t->button_line, "", "button_line", r->trigger_line);
     for (int i = 0; i < c->n_cameras; i++) {
         const struct config_camera *k = &c->camera[i];
         use_line(r, uses, &n, k->full_line, k->name, "full_line", r->camera_line[i]);
         use_line(r, uses, &n, k->half_line, k->name, "half_line", r->camera_line[i]);
         use_line(r, uses, &n, k->feedback_line, k->name, "feedback_line", r->camera_line[i]);
         use_line(r, uses, &n, k->relay_line, k->name, "relay_line", r->camera_line[i]);
+        half |= t->kind != TRIGGER_SOFTWARE && k->half_line != CONFIG_NONE;
         if (t->kind == TRIGGER_GPIO && k->full_line == CONFIG_NONE && t->full_line == CONFIG_NONE)
             complain(r, r->camera_line[i], "camera \"%s\" has no full_line and [trigger] has none for all; nothing would press it", k->name);
     }
     free(uses);
     if (t->kind == TRIGGER_GPIO && !t->chip[0])
-        complain(r, 0, "[trigger] kind = gpio needs 'chip = gpiochip0' or another (gpiodetect lists them)");
+        complain(r, r->trigger_line, "[trigger] kind = gpio needs 'chip = gpiochip0' or another (gpiodetect lists them)");
     if (t->kind == TRIGGER_SIMULATED && !t->address[0])
-        complain(r, 0, "[trigger] kind = simulated needs 'address = ' with rigsim's trigger socket");
-    if (t->hold_ms > t->max_hold_ms)
-        complain(r, 0, "[trigger] hold_ms = %u is longer than max_hold_ms = %u", t->hold_ms, t->max_hold_ms);
+        complain(r, r->trigger_line, "[trigger] kind = simulated needs 'address = ' with rigsim's trigger socket");
+    const uint32_t held_ms = t->hold_ms + (half ? t->half_press_ms : 0);
+    if (held_ms > t->max_hold_ms)
+        complain(r, r->hold_line, "%s hold a line for %u ms, longer than max_hold_ms = %u; raise that to %u or more (lag compensation comes on top), or shorten %s",
+                 half ? "half_press_ms and hold_ms" : "hold_ms would", held_ms, t->max_hold_ms, held_ms, half ? "them" : "it");
 }
 
 static void check_cameras(struct reader *r)

@@ -58,6 +58,7 @@ struct job {
     int64_t value;
     char dir[600], id[96]; // of the take, or of all takes
     char *text;
+    const struct config *config; // does not change
     struct ledger ledger;
     struct manifest_known *known;
     int n_known;
@@ -321,7 +322,7 @@ static void hear(struct worker *w)
             return;
         }
         if (n > CAMERA_MESSAGE_MAX || camera_event_decode(&e, packet, (size_t)n)) {
-            log_error("rigd: camera %s: its worker sent %zd bytes that are no message; killed", d->config.camera[w->camera].name, n);
+            log_error("camera %s: its worker sent %zd bytes that are no message; killed", d->config.camera[w->camera].name, n);
             kill(w->pid, SIGKILL);
             w->io = sd_event_source_disable_unref(w->io);
             return;
@@ -403,7 +404,7 @@ static void start_worker(struct daemon *d, int camera)
     const int err = spawn_worker(d, &d->worker[camera]);
     if (!err)
         return;
-    log_error("rigd: cannot start %s: %s", d->worker_path, strerror(-err));
+    log_error("cannot start %s: %s", d->worker_path, strerror(-err));
     snprintf(how, sizeof(how), "cannot start: %.60s", strerror(-err));
     rig_worker_gone(d->rig, now_ns(), camera, how);
 }
@@ -414,7 +415,7 @@ static void send_command(struct daemon *d, int camera, const struct camera_comma
     size_t n;
     char *text = camera_command_encode(c, &n);
     if (w->fd < 0 || !text || send(w->fd, text, n, MSG_DONTWAIT | MSG_NOSIGNAL) != (ssize_t)n) {
-        log_warning("rigd: camera %s: its worker does not take commands; killed", d->config.camera[camera].name);
+        log_warning("camera %s: its worker does not take commands; killed", d->config.camera[camera].name);
         if (w->pid > 0)
             kill(w->pid, SIGKILL);
     }
@@ -432,7 +433,7 @@ static void switch_power(struct daemon *d, int camera, bool on)
     snprintf(path, sizeof(path), "/sys/bus/usb/devices/%.*s:1.0/%.*s-port%s/disable", n, power, n, power, colon + 1);
     const int fd = open(path, O_WRONLY | O_CLOEXEC);
     if (fd < 0 || write(fd, on ? "0" : "1", 1) != 1)
-        log_warning("rigd: cannot switch %s: %s; this hub or kernel cannot, or rigd may not", path, strerror(errno));
+        log_warning("cannot switch %s: %s; this hub or kernel cannot, or rigd may not", path, strerror(errno));
     if (fd >= 0)
         close(fd);
 }
@@ -465,13 +466,13 @@ static void on_button(void *arg, int64_t at_ns)
     char why[200];
     (void)at_ns;
     if (capture(d, "button", false, why))
-        log_warning("rigd: the button was pressed: %s", why);
+        log_warning("the button was pressed: %s", why);
 }
 
 static void on_trigger_broken(void *arg, int err)
 {
     struct daemon *d = arg;
-    log_error("rigd: the trigger is gone: %s; it is opened again every %d s", strerror(-err), TRIGGER_RETRY_S);
+    log_error("the trigger is gone: %s; it is opened again every %d s", strerror(-err), TRIGGER_RETRY_S);
     rig_trigger_is(d->rig, now_ns(), -1);
     d->trigger_word = "broken";
     sd_event_source_set_time_relative(d->trigger_timer, 100000); // not from within its own dispatch
@@ -565,7 +566,7 @@ static void take_is_done(struct daemon *d)
     const double seconds = 1e-9 * (double)(now_ns() - d->take_began_ns);
     count_take(d, l);
     json_set_number(report, "seconds", seconds);
-    log_info("rigd: take %s: %s after %.2f s%s%s", l->id, take_state_name(l->state), seconds, l->reason[0] ? ": " : "", l->reason);
+    log_info("take %s: %s after %.2f s%s%s", l->id, take_state_name(l->state), seconds, l->reason[0] ? ": " : "", l->reason);
     control_reply(d->control, d->resuming ? d->resume_token : d->take_token, report);
     control_publish(d->control, "take", describe_take(l, false));
     if (d->resuming) {
@@ -590,13 +591,19 @@ static void work_reconcile(struct job *j)
     if (!j->err)
         j->err = ledger_bound(&j->ledger, j->dir);
     if (!j->err && (found.n_adopted || found.n_taken_back || found.n_parts_removed))
-        log_info("rigd: take %s: %d copies adopted, %d taken back, %d leftovers removed", j->id, found.n_adopted, found.n_taken_back, found.n_parts_removed);
+        log_info("take %s: %d copies adopted, %d taken back, %d leftovers removed", j->id, found.n_adopted, found.n_taken_back, found.n_parts_removed);
 }
 
 static void done_reconcile(struct daemon *d, struct job *j)
 {
     char why[200] = "";
     int err = j->err;
+    const bool is_final = j->ledger.state == TAKE_VERIFIED || j->ledger.state == TAKE_DEVELOPED || j->ledger.state == TAKE_SOLVED;
+    if (!err && is_final && ledger_is_whole(&j->ledger)) { // nothing is missing: its state stays what it is
+        control_reply(d->control, d->resume_token, describe_take(&j->ledger, false));
+        next_unfinished(d);
+        return;
+    }
     if (err)
         snprintf(why, sizeof(why), "its ledger or its frames cannot be read: %s; see the journal", strerror(-err));
     else
@@ -607,7 +614,7 @@ static void done_reconcile(struct daemon *d, struct job *j)
     }
     if (!err)
         return;
-    log_error("rigd: take %s cannot be resumed: %s", j->id, why);
+    log_error("take %s cannot be resumed: %s", j->id, why);
     control_refuse(d->control, d->resume_token, "cannot_resume", why);
     next_unfinished(d);
 }
@@ -633,13 +640,13 @@ static void look_for_work(struct daemon *d)
         d->take_began_ns = now_ns();
         snprintf(j->dir, sizeof(j->dir), "%s", d->takes_dir);
         snprintf(j->id, sizeof(j->id), "%s", d->unfinished[0]);
-        log_info("rigd: take %s is not finished; looking for its frames", j->id);
+        log_info("take %s: looking for frames that are not here yet", j->id);
         give(d, j);
     } else if (d->once && !d->once_started) {
         char why[200];
         d->once_started = true;
         if (capture(d, "once", false, why)) {
-            log_error("rigd: %s", why);
+            log_error("%s", why);
             d->exit_code = 1;
             sd_event_exit(d->event, 0);
         }
@@ -704,16 +711,6 @@ static void keep_lag(struct daemon *d)
 
 // ---- requests ----------------------------------------------------------------------------------------------------------------------------
 
-static int camera_named(const struct daemon *d, const struct json *request)
-{
-    const char *name = "";
-    json_get_string(request, "camera", &name);
-    for (int i = 0; i < d->config.n_cameras; i++)
-        if (!strcasecmp(d->config.camera[i].name, name))
-            return i;
-    return -1;
-}
-
 static void refuse(struct daemon *d, uint64_t token, int err, const char *why)
 {
     control_refuse(d->control, token, err == -EBUSY ? "busy" : err == -ENOTCONN ? "no_trigger" : "refused", why);
@@ -764,11 +761,46 @@ static void ask_calibrate(struct daemon *d, uint64_t token, const struct json *r
         d->lag_token = token;
 }
 
+// What exists, for somebody who asked for something else: "a, b, c" or "a, b, ... (n in all)".
+static void list_names(char *out, size_t room, const char *const *names, int n)
+{
+    size_t used = 0;
+    out[0] = 0;
+    for (int i = 0; i < n && used < room; i++) {
+        if (i == 8 && n > 10) {
+            snprintf(out + used, room - used, ", ... (%d in all)", n);
+            return;
+        }
+        used += (size_t)snprintf(out + used, room - used, "%s%s", i ? ", " : "", names[i]);
+    }
+}
+
+// The camera that is asked for, or -1: the request is refused then.
+static int camera_named(struct daemon *d, uint64_t token, const struct json *request)
+{
+    const char *name = "", *names[CONFIG_CAMERAS_MAX];
+    char list[400], why[600];
+    json_get_string(request, "camera", &name);
+    for (int i = 0; i < d->config.n_cameras; i++) {
+        names[i] = d->config.camera[i].name;
+        if (!strcasecmp(names[i], name))
+            return i;
+    }
+    list_names(list, sizeof(list), names, d->config.n_cameras);
+    snprintf(why, sizeof(why), "no camera '%.40s'; there are %s", name, list);
+    control_refuse(d->control, token, "no_such_camera", why);
+    return -1;
+}
+
 static void ask_identify(struct daemon *d, uint64_t token, const struct json *request)
 {
     char why[200];
-    const int i = camera_named(d, request);
-    const int err = rig_identify(d->rig, now_ns(), i, why);
+    const int i = camera_named(d, token, request);
+    if (i < 0)
+        return;
+    const int err = d->identify_token[i] ? -EBUSY : rig_identify(d->rig, now_ns(), i, why);
+    if (d->identify_token[i])
+        snprintf(why, sizeof(why), "it is showing itself already");
     if (err)
         refuse(d, token, err, why);
     else
@@ -778,7 +810,10 @@ static void ask_identify(struct daemon *d, uint64_t token, const struct json *re
 static void ask_reinstate(struct daemon *d, uint64_t token, const struct json *request)
 {
     char why[200];
-    const int err = rig_reinstate(d->rig, now_ns(), camera_named(d, request), why);
+    const int i = camera_named(d, token, request);
+    if (i < 0)
+        return;
+    const int err = rig_reinstate(d->rig, now_ns(), i, why);
     if (err)
         refuse(d, token, err, why);
     else
@@ -812,6 +847,32 @@ static void ask_metrics(struct daemon *d, uint64_t token, const struct json *req
     control_reply(d->control, token, o);
 }
 
+// Names the newest takes there are. (Folders are listed by the disk's thread.)
+static void work_no_such_take(struct job *j)
+{
+    struct dirent **entries = NULL;
+    const char *names[3] = { "" };
+    char list[900];
+    int n_listed = 0, n_all = 0;
+    const int n = scandir(j->dir, &entries, NULL, alphasort);
+    for (int i = n - 1; i >= 0; i--) {
+        n_all += entries[i]->d_name[0] != '.';
+        if (entries[i]->d_name[0] != '.' && n_listed < 3)
+            names[n_listed++] = entries[i]->d_name;
+    }
+    list_names(list, sizeof(list), names, n_listed);
+    if (asprintf(&j->text, "no take '%.60s' among %d; %s%s%s", j->id, n_all, n_all ? "the newest: " : "there is none yet in ", n_all ? list : j->dir, n_all > 3 ? "; rigctl takes lists all" : "") < 0)
+        j->text = NULL;
+    for (int i = 0; i < n; i++)
+        free(entries[i]);
+    free(entries);
+}
+
+static void done_no_such_take(struct daemon *d, struct job *j)
+{
+    control_refuse(d->control, j->token, "no_such_take", j->text ? j->text : "no such take; rigctl takes lists them");
+}
+
 // A take's folder in the request, checked: it becomes a path.
 static bool take_named(struct daemon *d, uint64_t token, const struct json *request, char id[96])
 {
@@ -826,7 +887,11 @@ static bool take_named(struct daemon *d, uint64_t token, const struct json *requ
             return true;
         }
     }
-    control_refuse(d->control, token, "no_such_take", "no take of that name; rigctl takes lists them");
+    struct job *j = new_job(work_no_such_take, done_no_such_take);
+    j->token = token;
+    snprintf(j->dir, sizeof(j->dir), "%s", d->takes_dir);
+    snprintf(j->id, sizeof(j->id), "%s", text);
+    give(d, j);
     return false;
 }
 
@@ -878,6 +943,13 @@ static void work_export(struct job *j)
     json_set_int(o, "n_files", j->err ? 0 : found.n_files);
     if (j->err == -EBADMSG)
         j->err = 0; // written, with "failed" where something differs: that is an answer
+    j->text = json_text(o);
+    json_free(o);
+}
+
+static void work_doctor(struct job *j)
+{
+    struct json *o = doctor_examine(j->config, "", j->dir);
     j->text = json_text(o);
     json_free(o);
 }
@@ -935,7 +1007,9 @@ static void ask_export(struct daemon *d, uint64_t token, const struct json *requ
 static void ask_doctor(struct daemon *d, uint64_t token, const struct json *request)
 {
     (void)request;
-    control_reply(d->control, token, doctor_examine(&d->config, "", d->takes_dir));
+    struct job *j = answer_job(d, token, work_doctor); // it walks through /proc, and asks the disk
+    j->config = &d->config;
+    give(d, j);
 }
 
 static void on_request(void *arg, uint64_t token, const char *what, const struct json *request)
@@ -993,7 +1067,7 @@ static void obey(struct daemon *d, const struct rig_action *a)
         return;
     case RIG_RELAY:
         if (!d->trigger || trigger_relay(d->trigger, a->camera, !a->on))
-            log_warning("rigd: camera %s: its relay could not be switched", d->config.camera[a->camera].name);
+            log_warning("camera %s: its relay could not be switched", d->config.camera[a->camera].name);
         return;
     case RIG_SPACE:
         j = new_job(work_space, done_space);
@@ -1088,7 +1162,7 @@ static int on_signal(sd_event_source *source, const struct signalfd_siginfo *si,
 {
     struct daemon *d = arg;
     (void)source;
-    log_info("rigd: %s: ending; a take under way is resumed at the next start", strsignal((int)si->ssi_signo));
+    log_info("%s: ending; a take under way is resumed at the next start", strsignal((int)si->ssi_signo));
     d->stopping = true;
     rig_stop(d->rig, now_ns());
     look_at_rig(NULL, d);
@@ -1111,7 +1185,7 @@ static int find_worker_program(struct daemon *d)
     if (!access(d->worker_path, X_OK))
         return 0;
     const int err = -errno;
-    log_error("rigd: cannot run %s: %s; install it beside rigd, or name it in RIGD_CAMERA", d->worker_path, strerror(-err));
+    log_error("cannot run %s: %s; install it beside rigd, or name it in RIGD_CAMERA", d->worker_path, strerror(-err));
     return err;
 }
 
@@ -1147,7 +1221,7 @@ static int set_up_loop(struct daemon *d)
     if (err >= 0)
         err = sd_event_set_watchdog(d->event, true);
     if (err < 0)
-        log_error("rigd: cannot set up the event loop: %s", strerror(-err));
+        log_error("cannot set up the event loop: %s", strerror(-err));
     return err < 0 ? err : 0;
 }
 
@@ -1269,7 +1343,7 @@ int daemon_run(const struct daemon_options *options)
     if (!err && options->takes_dir) {
         char *whole = make_directories(options->takes_dir) ? NULL : realpath(options->takes_dir, NULL);
         if (!whole || strlen(whole) >= sizeof(d->config.takes_dir)) {
-            log_error("rigd: --takes %s: expected a folder whose path has less than %zu bytes", options->takes_dir, sizeof(d->config.takes_dir));
+            log_error("--takes %s: expected a folder whose path has less than %zu bytes", options->takes_dir, sizeof(d->config.takes_dir));
             err = -EINVAL;
         } else {
             strcpy(d->config.takes_dir, whole);
@@ -1278,7 +1352,7 @@ int daemon_run(const struct daemon_options *options)
     }
     if (!err && options->socket_path) {
         if (strlen(options->socket_path) >= sizeof(d->config.socket_path)) {
-            log_error("rigd: --socket %s: longer than %zu bytes", options->socket_path, sizeof(d->config.socket_path) - 1);
+            log_error("--socket %s: longer than %zu bytes", options->socket_path, sizeof(d->config.socket_path) - 1);
             err = -EINVAL;
         } else {
             strcpy(d->config.socket_path, options->socket_path);

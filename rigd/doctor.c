@@ -100,70 +100,82 @@ static void check_usbfs(struct examination *x)
         find(x, "info", "usbfs", "usbfs_memory_mb %d, %d needed", have_mb, needed_mb);
 }
 
-// Which process has root/dev/... open? 0: none (or none that we may look at).
-static int holder_of(const struct examination *x, const char *device, char *name, size_t room)
+struct slot { // what hangs in a camera's port
+    char device[40]; // "/dev/bus/usb/001/017"; "": nothing, or no USB camera
+    int holder;      // process that has it open; 0: none, or none that we may look at
+};
+
+static void look_at_descriptors(const struct examination *x, int pid, struct slot *slots)
+{
+    char path[700], target[300];
+    snprintf(path, sizeof(path), "%s/proc/%d/fd", x->root, pid);
+    DIR *d = opendir(path);
+    for (const struct dirent *e; d && (e = readdir(d));) {
+        const ssize_t n = readlinkat(dirfd(d), e->d_name, target, sizeof(target) - 1);
+        if (n < 0)
+            continue;
+        target[n] = 0;
+        for (int i = 0; i < x->config->n_cameras && !strncmp(target, "/dev/bus/usb/", 13); i++)
+            if (!strcmp(target, slots[i].device))
+                slots[i].holder = pid;
+    }
+    if (d)
+        closedir(d);
+}
+
+// One pass for all cameras: a host has many processes.
+static void find_holders(const struct examination *x, struct slot *slots)
 {
     char proc[600];
     snprintf(proc, sizeof(proc), "%s/proc", x->root);
     DIR *d = opendir(proc);
-    int found = 0;
-    for (const struct dirent *e; d && !found && (e = readdir(d));) {
-        char fds[900];
+    for (const struct dirent *e; d && (e = readdir(d));) {
         const int pid = atoi(e->d_name);
-        if (pid <= 0)
-            continue;
-        snprintf(fds, sizeof(fds), "%s/%d/fd", proc, pid);
-        DIR *f = opendir(fds);
-        for (const struct dirent *g; f && !found && (g = readdir(f));) {
-            char target[300];
-            const ssize_t n = readlinkat(dirfd(f), g->d_name, target, sizeof(target) - 1);
-            if (n < 0)
-                continue;
-            target[n] = 0;
-            if (!strcmp(target, device))
-                found = pid;
-        }
-        if (f)
-            closedir(f);
+        if (pid > 0)
+            look_at_descriptors(x, pid, slots);
     }
     if (d)
         closedir(d);
-    char comm[60];
-    snprintf(comm, sizeof(comm), "/proc/%d/comm", found);
-    if (!found || !read_line(x, comm, name, room))
-        snprintf(name, room, "?");
-    return found;
+}
+
+static void check_port(struct examination *x, const struct config_camera *c, struct slot *slot)
+{
+    char about[40], path[200], full[700], serial[80];
+    snprintf(about, sizeof(about), "camera %s", c->name);
+    snprintf(path, sizeof(path), "/sys/bus/usb/devices/%.80s/busnum", c->port + 4);
+    const int bus = read_number(x, path, -1);
+    snprintf(path, sizeof(path), "/sys/bus/usb/devices/%.80s/devnum", c->port + 4);
+    const int number = read_number(x, path, -1);
+    if (bus < 0 || number < 0) {
+        find(x, "error", about, "nothing is plugged into its port %s: check cable, hub and power", c->port);
+        return;
+    }
+    snprintf(path, sizeof(path), "/sys/bus/usb/devices/%.80s/serial", c->port + 4);
+    if (c->serial[0] && read_line(x, path, serial, sizeof(serial))) {
+        const size_t n = strlen(serial), m = strlen(c->serial); // USB pads with zeros
+        if (m > n ? strcmp(c->serial, serial) : strcmp(serial + n - m, c->serial))
+            find(x, "error", about, "in its port %s hangs serial %s, rigd.conf says %s: plug the right body, or correct rigd.conf", c->port, serial, c->serial);
+    }
+    snprintf(slot->device, sizeof(slot->device), "/dev/bus/usb/%03d/%03d", bus, number);
+    snprintf(full, sizeof(full), "%s%.39s", x->root, slot->device);
+    if (access(full, R_OK | W_OK))
+        find(x, "error", about, "%s: %s: install rigd's udev rules, and let rigd's user be in group plugdev", slot->device, strerror(errno));
 }
 
 static void check_ports(struct examination *x)
 {
+    struct slot slots[CONFIG_CAMERAS_MAX] = { 0 };
+    for (int i = 0; i < x->config->n_cameras; i++)
+        if (!strncmp(x->config->camera[i].port, "usb:", 4))
+            check_port(x, &x->config->camera[i], &slots[i]);
+    find_holders(x, slots);
     for (int i = 0; i < x->config->n_cameras; i++) {
-        const struct config_camera *c = &x->config->camera[i];
-        char about[40], path[200], device[60], full[700], serial[80], name[60];
-        if (strncmp(c->port, "usb:", 4))
+        char about[40], path[60], name[60] = "?";
+        snprintf(path, sizeof(path), "/proc/%d/comm", slots[i].holder);
+        if (!slots[i].holder || (read_line(x, path, name, sizeof(name)) && !strncmp(name, "rigd", 4)))
             continue;
-        snprintf(about, sizeof(about), "camera %s", c->name);
-        snprintf(path, sizeof(path), "/sys/bus/usb/devices/%.80s/busnum", c->port + 4);
-        const int bus = read_number(x, path, -1);
-        snprintf(path, sizeof(path), "/sys/bus/usb/devices/%.80s/devnum", c->port + 4);
-        const int number = read_number(x, path, -1);
-        if (bus < 0 || number < 0) {
-            find(x, "error", about, "nothing is plugged into its port %s: check cable, hub and power", c->port);
-            continue;
-        }
-        snprintf(path, sizeof(path), "/sys/bus/usb/devices/%.80s/serial", c->port + 4);
-        if (c->serial[0] && read_line(x, path, serial, sizeof(serial))) {
-            const size_t n = strlen(serial), m = strlen(c->serial); // USB pads with zeros
-            if (m > n ? strcmp(c->serial, serial) : strcmp(serial + n - m, c->serial))
-                find(x, "error", about, "in its port %s hangs serial %s, rigd.conf says %s: plug the right body, or correct rigd.conf", c->port, serial, c->serial);
-        }
-        snprintf(device, sizeof(device), "/dev/bus/usb/%03d/%03d", bus, number);
-        snprintf(full, sizeof(full), "%s%s", x->root, device);
-        if (access(full, R_OK | W_OK))
-            find(x, "error", about, "%s: %s: install rigd's udev rules, and let rigd's user be in group plugdev", device, strerror(errno));
-        const int pid = holder_of(x, device, name, sizeof(name));
-        if (pid && strncmp(name, "rigd", 4))
-            find(x, "error", about, "%s is held by %s (process %d): stop it; rigd's udev rules keep the desktop away", device, name, pid);
+        snprintf(about, sizeof(about), "camera %s", x->config->camera[i].name);
+        find(x, "error", about, "%s is held by %s (process %d): stop it; rigd's udev rules keep the desktop away", slots[i].device, name, slots[i].holder);
     }
 }
 

@@ -32,6 +32,7 @@ enum {
     TRIES_MAX = 3, DISK_TRIES_MAX = 10, COMMIT_TRIES_MAX = 30, FIRE_TRIES_MAX = 3,
     FIRE_LEAD_MS = 30,        // from the decision to half-press
     AFTER_EXPOSURE_MS = 100,
+    UNMEASURED_LAG_MS = 350,  // from full-press to the open shutter, of a body whose lag is not known; one that slept takes so long
     FEEDBACK_WAIT_MS = 1000,  // calibration: flash-sync contacts close within
     RECONCILE_MS = 4000,      // how long a card is listed again before a frame counts as missed
     LATE_MS = 2,              // a shutter further than this from the median is named
@@ -113,7 +114,7 @@ struct rig {
     int64_t commit_retry_ns;
 
     int n_fire_tries, n_shots, n_shots_wanted;
-    int64_t at_ns, pressed_ns, late_ns, quiet_until_ns, shot_ns;
+    int64_t at_ns, pressed_ns, late_ns, released_ns, quiet_until_ns, shot_ns;
     uint32_t *delay_us;
     uint64_t skip[CONFIG_CAMERAS_MAX / 64];
 
@@ -582,6 +583,11 @@ static void climb(struct rig *r, int i, int64_t now)
     const bool wired_power = b->config->power[0], wired_relay = b->config->relay_line != CONFIG_NONE && r->abilities >= 0 && (r->abilities & TRIGGER_RELAYS);
     b->condition = RIG_RECOVERING;
     start_more(r, now); // its place at the start is free
+    if (is_silent(r)) { // its worker may come again, its port and its supply are left alone: its shutter may be open
+        if (!b->worker)
+            start_worker(r, i, now);
+        return;
+    }
     b->rung++;
     if (b->rung == 3 && !wired_power)
         b->rung++;
@@ -835,12 +841,25 @@ static double longest_shutter_s(const struct rig *r)
     return longest;
 }
 
-static int64_t longest_delay_ns(const struct rig *r)
+// When the last exposure is over, or cannot last longer: where a flash-sync contact was seen, it says when its shutter opened.
+static int64_t exposed_ns(const struct rig *r)
 {
-    uint32_t longest_us = 0;
-    for (int i = 0; i < r->n; i++)
-        longest_us = r->delay_us[i] > longest_us ? r->delay_us[i] : longest_us;
-    return (int64_t)longest_us * 1000;
+    int64_t open_ns = r->pressed_ns;
+    for (int i = 0; i < r->n; i++) {
+        const struct body *b = &r->body[i];
+        const double lag_ms = r->purpose == FOR_LAG ? FEEDBACK_WAIT_MS : b->lag.n ? b->lag.mean_ms + 5 * b->lag.std_ms : UNMEASURED_LAG_MS;
+        const bool seen = b->flash_ns != INT64_MIN && r->abilities >= 0 && (r->abilities & TRIGGER_FEEDBACK);
+        const int64_t at = seen ? b->flash_ns : r->pressed_ns + (int64_t)(1e3 * r->delay_us[i] + 1e6 * lag_ms);
+        if (b->part && at > open_ns)
+            open_ns = at;
+    }
+    return open_ns + (int64_t)(longest_shutter_s(r) * 1e9);
+}
+
+static int64_t quiet_until_ns(const struct rig *r)
+{
+    const int64_t exposed = exposed_ns(r);
+    return (exposed > r->released_ns ? exposed : r->released_ns) + AFTER_EXPOSURE_MS * MS;
 }
 
 static void begin_fire(struct rig *r, int64_t now)
@@ -862,9 +881,15 @@ static void begin_fire(struct rig *r, int64_t now)
             r->skip[i / 64] |= UINT64_C(1) << i % 64;
         r->body[i].flash_ns = INT64_MIN;
     }
-    if (measured && (r->abilities & TRIGGER_DELAYS) && r->purpose == FOR_TAKE)
-        lag_delays(lag, r->n, MAX_DELAY_US, r->delay_us);
     const uint32_t half_ms = r->abilities & TRIGGER_HALF_PRESS ? t->half_press_ms : 0;
+    if (measured && (r->abilities & TRIGGER_DELAYS) && r->purpose == FOR_TAKE) {
+        const uint32_t held_ms = half_ms + t->hold_ms; // half-press waits for the slowest: delays count towards max_hold_ms
+        const uint32_t room_us = t->max_hold_ms > held_ms ? 1000 * (t->max_hold_ms - held_ms) : 0;
+        const int n_clipped = lag_delays(lag, r->n, room_us < MAX_DELAY_US ? room_us : MAX_DELAY_US, r->delay_us);
+        if (n_clipped)
+            say(r, RIG_WARNING, CONFIG_NONE, "lag of %d cameras is not made up for in full: max_hold_ms = %u leaves %u ms for delays; raise it in rigd.conf", n_clipped, t->max_hold_ms,
+                (room_us < MAX_DELAY_US ? room_us : MAX_DELAY_US) / 1000);
+    }
     struct trigger_shot *shot = &act(r, RIG_FIRE, CONFIG_NONE)->shot;
     r->at_ns = now + (FIRE_LEAD_MS + (int64_t)half_ms) * MS;
     *shot = (struct trigger_shot){ .at_ns = r->at_ns, .half_ms = half_ms, .hold_ms = t->hold_ms, .delay_us = r->delay_us, .skip = r->skip };
@@ -1460,6 +1485,8 @@ void rig_feedback(struct rig *r, int64_t now, int i, int64_t at_ns)
     const bool shooting = r->phase == PHASE_FIRE || r->phase == PHASE_EXPOSE || r->phase == PHASE_COLLECT;
     if (shooting && b->part && b->flash_ns == INT64_MIN && at_ns >= r->at_ns - MS)
         b->flash_ns = at_ns;
+    if (r->phase == PHASE_EXPOSE)
+        r->quiet_until_ns = quiet_until_ns(r);
 }
 
 void rig_fired(struct rig *r, int64_t now, int err, int64_t pressed_ns, int64_t late_ns)
@@ -1477,9 +1504,8 @@ void rig_fired(struct rig *r, int64_t now, int err, int64_t pressed_ns, int64_t 
         r->pressed_ns = pressed_ns ? pressed_ns : r->at_ns;
         r->late_ns = late_ns;
         r->shot_ns = r->pressed_ns;
-        const double wait_s = fmax(longest_shutter_s(r), r->purpose == FOR_LAG ? 1e-3 * FEEDBACK_WAIT_MS : 0);
-        const int64_t closed_ns = r->pressed_ns + (int64_t)(wait_s * 1e9);
-        r->quiet_until_ns = (now > closed_ns ? now : closed_ns) + longest_delay_ns(r) + AFTER_EXPOSURE_MS * MS;
+        r->released_ns = now;
+        r->quiet_until_ns = quiet_until_ns(r);
         r->phase = PHASE_EXPOSE;
         if (r->purpose == FOR_TAKE) {
             r->ledger.synchronised = r->abilities >= 0 && (r->abilities & TRIGGER_SYNCHRONISED);

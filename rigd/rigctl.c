@@ -35,13 +35,13 @@ static int connect_to(const char *path)
 {
     struct sockaddr_un address = { .sun_family = AF_UNIX };
     if (strlen(path) >= sizeof(address.sun_path)) {
-        log_error("rigctl: --socket %s: longer than %zu bytes", path, sizeof(address.sun_path) - 1);
+        log_error("--socket %s: longer than %zu bytes", path, sizeof(address.sun_path) - 1);
         return -1;
     }
     strcpy(address.sun_path, path);
     const int fd = socket(AF_UNIX, SOCK_STREAM | SOCK_CLOEXEC, 0);
     if (fd < 0 || connect(fd, (struct sockaddr *)&address, sizeof(address))) {
-        log_error("rigctl: cannot reach rigd at %s: %s; %s", path, strerror(errno),
+        log_error("cannot reach rigd at %s: %s; %s", path, strerror(errno),
                   errno == EACCES ? "become a member of rigd's group" : "is it running (systemctl status rigd)? --socket or RIGD_SOCKET names another");
         if (fd >= 0)
             close(fd);
@@ -74,7 +74,7 @@ static struct json *next_message(struct line_reader *r)
         if (n < 0 && errno == EINTR)
             continue;
         if (n <= 0) {
-            log_error("rigctl: rigd ended the conversation; journalctl -u rigd says why");
+            log_error("rigd ended the conversation; journalctl -u rigd says why");
             return NULL;
         }
         r->n += (size_t)n;
@@ -160,9 +160,11 @@ static struct json *ask(const struct arguments *a, struct json *request, bool ev
     close(r.fd);
     free(r.bytes);
     if (answer && !flag_of(answer, "ok")) {
-        log_error("rigctl: %s", text_of(answer, "error.text"));
-        if (a->json)
-            puts(json_text(answer));
+        log_error("%s", text_of(answer, "error.text"));
+        char *text = a->json ? json_text(answer) : NULL;
+        if (text)
+            puts(text);
+        free(text);
         json_free(answer);
         return NULL;
     }
@@ -403,7 +405,7 @@ static int calibrate(const struct arguments *a)
         return err;
     const bool good = !text_of(answer, "result.outcome")[0];
     if (!good)
-        log_error("rigctl: %s", text_of(answer, "result.outcome"));
+        log_error("%s", text_of(answer, "result.outcome"));
     json_free(answer);
     return good ? EXIT_DONE : EXIT_FAILED;
 }
@@ -432,6 +434,8 @@ static int cancel(const struct arguments *a)
 
 static void print_takes(const struct json *t)
 {
+    if (!json_length(t, "takes"))
+        puts("no takes yet");
     for (int i = 0; i < json_length(t, "takes"); i++) {
         const struct json *e = element(t, "takes", i);
         printf("%-44s %-10s %4.0f/%-4.0f %9.1f MB  %s\n", text_of(e, "id"), text_of(e, "state"), number_of(e, "n_delivered", 0), number_of(e, "n_expected", 0),

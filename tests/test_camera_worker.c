@@ -376,7 +376,7 @@ static void a_lost_event_is_made_up_for_by_the_listing(void **state)
             assert_int_equal(e->n_objects, 0); // time is up, and that is no failure
             e = done(&w, (struct camera_command){ .kind = CAMERA_LIST, .n_objects = 8 });
             assert_int_equal(e->n_listed, shot);
-            char name[16];
+            char name[24];
             snprintf(name, sizeof(name), "A%d.dng", shot);
             done(&w, fetching(CAMERA_FETCH, &w.answer.object[shot - 1], name));
         }
@@ -434,6 +434,27 @@ static void what_a_body_does_not_take_is_told_not_hidden(void **state)
     assert_string_equal(e->setting[2].found, "not offered");
     worker_stop(&w);
     sim_stop(&s);
+}
+
+static void a_body_shows_itself_and_works_on(void **state)
+{
+    (void)state;
+    for (int k = 0; k < 3; k++) {
+        struct sim s;
+        struct worker w;
+        const struct camera_command c = { .kind = CAMERA_IDENTIFY, .timeout_ms = 1000 };
+        sim_start(&s, kinds[k][0], NULL);
+        worker_start(&w);
+        done(&w, opening(&s, kinds[k][1]));
+        if (k)
+            done(&w, c);
+        else
+            fails(&w, c, CAMERA_REFUSED); // it has nothing to show
+        release_shutter(&w); // live view is off again
+        assert_int_equal(done(&w, (struct camera_command){ .kind = CAMERA_COLLECT, .n_objects = 1 })->n_objects, 1);
+        worker_stop(&w);
+        sim_stop(&s);
+    }
 }
 
 static void a_flood_of_events_is_named_and_ends(void **state)
@@ -603,7 +624,7 @@ static void hostile_replies_are_survived_or_kill_only_the_worker(void **state)
     struct sim s;
     struct worker w[N];
     bool alive[N];
-    char script[N * 48] = "", name[16];
+    char script[N * 48] = "", name[24];
     int n_answers = 0;
     for (int i = 0; i < N; i++) {
         const size_t n = strlen(script);
@@ -670,6 +691,7 @@ int main(void)
         cmocka_unit_test(a_lost_event_is_made_up_for_by_the_listing),
         cmocka_unit_test(the_wrong_body_is_not_used),
         cmocka_unit_test(what_a_body_does_not_take_is_told_not_hidden),
+        cmocka_unit_test(a_body_shows_itself_and_works_on),
         cmocka_unit_test(a_flood_of_events_is_named_and_ends),
         cmocka_unit_test(a_busy_body_is_busy_and_not_bare_of_settings),
         cmocka_unit_test(a_full_card_is_the_card),

@@ -92,10 +92,14 @@ static void each_fault_is_named_with_its_line_and_a_remedy(void **state)
         { "[rig]\ntakes = /t\nraw_mb = 60.5\n[trigger]\nkind = software\n" A01, "rigd.conf:3:", "whole number from 1 to 4096" },
         { "[rig]\ntakes = /t\nraw_mb = 1e3\n[trigger]\nkind = software\n" A01, "rigd.conf:3:", "found '1e3'" },
         { "[rig]\ntakes = /t\n[trigger]\nkind = gpio\nchip = c\n" A01, "rigd.conf:6:", "nothing would press it" },
-        { "[rig]\ntakes = /t\n[trigger]\nkind = gpio\nfull_line = 1\n" A01, "rigd.conf: ", "chip" },
-        { "[rig]\ntakes = /t\n[trigger]\nkind = simulated\n" A01, "rigd.conf: ", "address" },
+        { "[rig]\ntakes = /t\n[trigger]\nkind = gpio\nfull_line = 1\n" A01, "rigd.conf:3:", "chip" },
+        { "[rig]\ntakes = /t\n[trigger]\nkind = simulated\n" A01, "rigd.conf:3:", "address" },
         { "[rig]\ntakes = /t\n[trigger]\nkind = gpio\nchip = c\nfull_line = 4\n" A01 "feedback_line = 4\n", "rigd.conf:7:", "line 4 is [trigger] full_line already" },
-        { "[rig]\ntakes = /t\n[trigger]\nkind = software\nhold_ms = 500\nmax_hold_ms = 100\n" A01, "rigd.conf: ", "longer than max_hold_ms" },
+        { "[rig]\ntakes = /t\n[trigger]\nkind = software\nhold_ms = 500\nmax_hold_ms = 100\n" A01, "rigd.conf:6:", "longer than max_hold_ms = 100; raise that to 500" },
+        { "[rig]\ntakes = /t\n[trigger]\nkind = gpio\nchip = c\nfull_line = 4\nhalf_line = 5\nhold_ms = 500\nmax_hold_ms = 900\n" A01, "rigd.conf:9:", "raise that to 1000" },
+        { "[rig]\ntakes = /t\n[trigger]\nkind = gpio\nchip = c\nfull_line = 4\nmax_hold_ms = 600\n" A01 "half_line = 5\n", "rigd.conf:7:", "half_press_ms and hold_ms hold a line for 650 ms" },
+        { "[rig]\ntakes = /t\n[trigger]\nkind = simulated\naddress = @wires\nhalf_press_ms = 2000\n" A01, "rigd.conf:6:", "raise that to 2150" },
+        { "[rig]\ntakes = /t\n[trigger]\nkind = simulated\naddress = @\n" A01, "rigd.conf:5:", "begins with /" },
         { HEAD "[camera \"A01\"]\nport = usb:1,17\n", "rigd.conf:6:", "usb:BUS-PORT" },
         { HEAD "[camera \"A01\"]\nport = ptpip:localhost:1:2\n", "rigd.conf:6:", "IPV4" },
         { HEAD "[camera \"A01\"]\nport = ptpip:127.0.0.1:15740\n", "rigd.conf:6:", "EVENTPORT" },
@@ -117,6 +121,41 @@ static void each_fault_is_named_with_its_line_and_a_remedy(void **state)
             fail_msg("case %zu: %d, said: %s", i, err, said);
         assert_null(c.camera);
     }
+}
+
+static void a_line_without_half_press_may_be_held_for_all_of_its_limit(void **state)
+{
+    (void)state;
+    struct config c;
+    assert_int_equal(parse(&c, "[rig]\ntakes = /t\n[trigger]\nkind = gpio\nchip = c\nfull_line = 4\nhold_ms = 600\nmax_hold_ms = 600\n" A01), 0);
+    config_free(&c);
+}
+
+static void what_rigsim_lists_is_accepted_as_it_stands(void **state)
+{
+    (void)state;
+    static const char *const wires[] = { "", "--trigger-socket=@wires", "--trigger-socket=/run/wires" };
+    static const char *const kinds[][2] = { { "generic", "generic" }, { "nikon", "nikon" }, { "canon", "canon-eos" } };
+    const char *bin = getenv("BIN");
+    for (int k = 0; k < 3; k++)
+        for (int i = 0; i < 3; i++) {
+            static char text[100000];
+            char command[300];
+            struct config c;
+            snprintf(command, sizeof(command), "%s/rigsim --list --cameras %d --personality %s %s", bin ? bin : "build/bin", CONFIG_CAMERAS_MAX, kinds[k][0], wires[i]);
+            strcpy(text, i ? "[rig]\ntakes = /t\n" : "[rig]\ntakes = /t\n[trigger]\nkind = software\n");
+            FILE *f = popen(command, "r");
+            assert_non_null(f);
+            const size_t n = strlen(text), got = fread(text + n, 1, sizeof(text) - n - 1, f);
+            text[n + got] = 0;
+            assert_int_equal(pclose(f), 0);
+            if (parse(&c, text))
+                fail_msg("%s: %s", command, said);
+            assert_int_equal(c.n_cameras, CONFIG_CAMERAS_MAX);
+            assert_string_equal(c.camera[255].personality, kinds[k][1]);
+            assert_string_equal(c.trigger.address, wires[i][0] ? strchr(wires[i], '=') + 1 : "");
+            config_free(&c);
+        }
 }
 
 static void a_thousand_faults_do_not_fill_the_journal(void **state)
@@ -152,6 +191,8 @@ int main(void)
     const struct CMUnitTest tests[] = {
         cmocka_unit_test(a_whole_configuration_is_read),
         cmocka_unit_test(each_fault_is_named_with_its_line_and_a_remedy),
+        cmocka_unit_test(a_line_without_half_press_may_be_held_for_all_of_its_limit),
+        cmocka_unit_test(what_rigsim_lists_is_accepted_as_it_stands),
         cmocka_unit_test(a_thousand_faults_do_not_fill_the_journal),
         cmocka_unit_test(zero_bytes_and_other_line_ends_are_no_trouble),
     };

@@ -78,7 +78,10 @@ static struct world {
     int n_copies;
     // trigger
     bool shutters_held, calibrating;
-    int64_t silent_until_ns;
+    int64_t silent_until_ns; // INT64_MAX: it is not known yet when the last exposure ends
+    int64_t exposed_ns, released_ns;
+    int n_to_open;           // pressed bodies whose shutter has not opened
+    double shutter_s;
     int n_fired, fire_err, n_fire_refusals, abilities;
     int64_t open_first_ns[N_MAX];
     bool supply_off[N_MAX];
@@ -178,7 +181,9 @@ static const struct ledger_object *durable_object(int camera, const struct camer
 static void expose(int i)
 {
     struct sim_camera *c = &w.camera[i];
-    if (!c->open || strikes(&c->fault.no_shot))
+    if (w.abilities ? w.supply_off[i] || c->fault.dead : !c->open) // a wire presses whatever the worker does
+        return;
+    if (strikes(&c->fault.no_shot))
         return;
     const int n_files = w.config.objects_per_shot + strikes(&c->fault.extra);
     for (int n = 0; n < n_files; n++) {
@@ -430,6 +435,8 @@ static void obey(const struct rig_action *a)
         break;
     case RIG_CREATE:
     case RIG_COMMIT:
+        if (a->kind == RIG_CREATE)
+            w.silent_until_ns = INT64_MAX; // all have answered; what is sent now may still be on its way at half-press
         copy_ledger(&w.pending, rig_ledger(w.rig));
         later((int64_t)(uniform(2, 40) * MS), W_COMMITTED, -1, a->kind == RIG_CREATE);
         break;
@@ -448,14 +455,20 @@ static void obey(const struct rig_action *a)
         }
         w.shutters_held = true;
         w.n_fired++;
+        w.silent_until_ns = INT64_MAX;
+        w.exposed_ns = w.released_ns = a->shot.at_ns + (int64_t)a->shot.hold_ms * MS;
+        w.n_to_open = 0;
         for (int i = 0; i < w.config.n_cameras; i++) {
             if (a->shot.skip[i / 64] >> i % 64 & 1)
                 continue;
             const int64_t press = a->shot.at_ns - w.now + (int64_t)a->shot.delay_us[i] * 1000;
+            const int64_t release = w.now + press + (int64_t)a->shot.hold_ms * MS;
             later(press, W_PRESS, i, 0);
+            w.n_to_open++;
+            w.released_ns = release > w.released_ns ? release : w.released_ns;
+            assert_true(a->shot.half_ms + a->shot.delay_us[i] / 1000 + a->shot.hold_ms <= w.config.trigger.max_hold_ms); // it would be refused
         }
-        later(a->shot.at_ns - w.now + 990 * MS + a->shot.hold_ms * MS, W_FIRED, -1, a->shot.at_ns);
-        w.silent_until_ns = a->shot.at_ns + (int64_t)a->shot.hold_ms * MS;
+        later(w.released_ns - w.now, W_FIRED, -1, a->shot.at_ns);
         break;
     case RIG_RELEASE:
         w.shutters_held = false;
@@ -481,9 +494,20 @@ static void obey(const struct rig_action *a)
         w.n_lags_done++;
         break;
     case RIG_STATE:
+        if (rig_state(w.rig) == TAKE_FAILED && !w.shutters_held)
+            w.silent_until_ns = 0; // no shot
+        break;
     case RIG_IDENTIFIED:
         break;
     }
+}
+
+// One more body was pressed: its shutter closes then. After the last of them is known, so is the end of the silence.
+static void exposes_until(int64_t at_ns)
+{
+    w.exposed_ns = at_ns > w.exposed_ns ? at_ns : w.exposed_ns;
+    if (!--w.n_to_open)
+        w.silent_until_ns = w.exposed_ns;
 }
 
 static void happen(const struct happening *h)
@@ -523,11 +547,13 @@ static void happen(const struct happening *h)
         break;
     case W_PRESS: {
         if (w.abilities == 0) {
+            exposes_until(w.now);
             rig_press_camera(w.rig, w.now, h->camera);
             break;
         }
         const double lag_ms = c->lag_ms + c->jitter_ms * normal();
         expose(h->camera);
+        exposes_until(w.now + (int64_t)(lag_ms * 1e6 + w.shutter_s * 1e9));
         if (w.abilities & TRIGGER_FEEDBACK)
             later((int64_t)(lag_ms * 1e6), W_FLASH, h->camera, w.now + (int64_t)(lag_ms * 1e6));
         break;
@@ -589,6 +615,7 @@ static void set_up(int n_cameras, uint64_t seed)
     w.random = seed * UINT64_C(0x9e3779b97f4a7c15) + 1;
     w.now = 1000 * S;
     w.free_bytes = INT64_C(1) << 42;
+    w.shutter_s = 1. / 125;
     w.abilities = TRIGGER_SYNCHRONISED | TRIGGER_HALF_PRESS | TRIGGER_DELAYS | TRIGGER_FEEDBACK | TRIGGER_RELAYS;
     struct config *c = &w.config;
     *c = (struct config){ .objects_per_shot = 1, .raw_mb = 30, .free_space_mb = 1000, .thumbnails = true, .fetch_limit = 8, .heartbeat_s = 25,
@@ -786,6 +813,54 @@ static void one_fault_at_any_command_costs_no_frame(void **state)
             tear_down();
         }
     }
+}
+
+// The world asserts it at each command; here something happens that makes the rig want to send.
+static void nothing_is_sent_from_the_last_answer_before_half_press_to_the_end_of_exposure(void **state)
+{
+    (void)state;
+    for (int calibrated = 0; calibrated < 2; calibrated++)
+        for (int ms = 0; ms < 3000; ms += 50) {
+            const struct rig_take take = { "20261122T090000_story", "story", "2026-11-22T09:00:00Z", 1795338000000, "/takes" };
+            struct lag lag[5];
+            char why[200];
+            set_up(5, 200 + (uint64_t)ms);
+            w.shutter_s = 1.6;
+            for (int i = 0; i < 5; i++) {
+                strcpy(w.config.camera[i].setting[0].value, "1.6");
+                lag[i] = (struct lag){ .mean_ms = w.camera[i].lag_ms, .std_ms = w.camera[i].jitter_ms, .n = 30 };
+                w.camera[i].take_first = w.camera[i].n_card + 1;
+            }
+            w.config.camera[2].relay_line = 7;
+            if (calibrated) {
+                rig_set_lag(w.rig, lag);
+            } else { // nothing is known, nothing is seen, and a body slept
+                w.camera[3].lag_ms += 200;
+                w.abilities &= ~TRIGGER_FEEDBACK;
+                rig_trigger_is(w.rig, w.now, w.abilities);
+            }
+            open_all();
+            assert_int_equal(rig_capture(w.rig, w.now, &take, false, why), 0);
+            while (w.silent_until_ns != INT64_MAX)
+                run(MS, false);
+            run(ms * MS, false);
+            const bool silent = w.now < w.silent_until_ns;
+            for (int crashes = 0; crashes < 5 && silent && w.now < w.silent_until_ns; crashes++) { // enough for each rung of the ladder
+                w.camera[2].worker = w.camera[2].open = w.camera[2].in_flight = false;
+                rig_worker_gone(w.rig, w.now, 2, "killed by signal 11");
+                run(MS, false);
+                assert_false(w.supply_off[2]);
+                run(99 * MS, false); // it is back, and could be opened
+            }
+            run(120 * S, true);
+            drain_actions();
+            const struct ledger *l = rig_ledger(w.rig);
+            check_accounts(l);
+            if (l->state != TAKE_VERIFIED)
+                fail_msg("crash after %d ms: %s", ms, l->reason);
+            assert_true(silent || ms > 1500);
+            tear_down();
+        }
 }
 
 static void others_do_not_wait_for_a_camera_in_trouble(void **state)
@@ -1046,6 +1121,15 @@ static void lag_is_measured_and_compensated(void **state)
     check_accounts(l);
     assert_true(l->sigma_ns < sigma_before * 2 / 3);
     assert_true(l->spread_ns < spread_before);
+    w.config.trigger.max_hold_ms = 510; // leaves 10 ms of the 20 that are needed
+    w.n_said = 0;
+    l = capture_as("20261122T090002_story", false);
+    check_accounts(l);
+    assert_int_equal(l->state, TAKE_VERIFIED);
+    bool told = false;
+    for (int i = 0; i < w.n_said; i++)
+        told |= strstr(w.said[i], "max_hold_ms = 510 leaves 10 ms") != NULL;
+    assert_true(told);
     tear_down();
 }
 
@@ -1194,6 +1278,7 @@ int main(void)
         cmocka_unit_test(a_lost_event_is_found_on_the_card),
         cmocka_unit_test(a_shutter_that_stays_closed_is_named_with_slot_and_remedy),
         cmocka_unit_test(one_fault_at_any_command_costs_no_frame),
+        cmocka_unit_test(nothing_is_sent_from_the_last_answer_before_half_press_to_the_end_of_exposure),
         cmocka_unit_test(others_do_not_wait_for_a_camera_in_trouble),
         cmocka_unit_test(a_camera_is_recovered_or_quarantined_within_15_s),
         cmocka_unit_test(a_camera_that_stays_busy_is_quarantined_after_5_s),

@@ -11,7 +11,7 @@ enum canon_operation {
     GET_STORAGE_IDS = 0x9101, GET_STORAGE_INFO, GET_OBJECT_INFO, GET_OBJECT, DELETE_OBJECT, GET_PARTIAL_OBJECT = 0x9107,
     GET_OBJECT_INFO_EX = 0x9109, GET_THUMB_EX, REMOTE_RELEASE = 0x910f, SET_PROPERTY_EX, SET_REMOTE_MODE = 0x9114, SET_EVENT_MODE,
     GET_EVENT, TRANSFER_COMPLETE, PC_CAPACITY = 0x911a, SET_UI_LOCK, RESET_UI_LOCK, KEEP_DEVICE_ON,
-    REQUEST_PROPERTY = 0x9127, RELEASE_ON, RELEASE_OFF
+    REQUEST_PROPERTY = 0x9127, RELEASE_ON, RELEASE_OFF, START_VIEWFINDER = 0x9151, END_VIEWFINDER
 };
 enum canon_record {
     RECORD_OBJECT_ADDED = 0xc181, RECORD_OBJECT_REMOVED = 0xc182, RECORD_REQUEST_TRANSFER = 0xc186,
@@ -290,6 +290,8 @@ bool ptp_canon_answer(struct ptp_session *s, const struct ptp_request *q, struct
     case SET_UI_LOCK:
     case RESET_UI_LOCK:
     case KEEP_DEVICE_ON:
+    case START_VIEWFINDER: // there are no pictures of it: 0x9153 is announced, and refused
+    case END_VIEWFINDER:
         return true;
     case REQUEST_PROPERTY:
         if (ptp_find_property(s, q->param[0]) < 0)

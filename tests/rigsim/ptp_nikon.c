@@ -5,8 +5,10 @@
 
 enum nikon_operation {
     CAPTURE_IN_RAM = 0x90c0, AF_DRIVE, CHANGE_CAMERA_MODE, DELETE_RAM_IMAGE, GET_LARGE_THUMB, GET_EVENT = 0x90c7, DEVICE_READY,
-    GET_VENDOR_PROPERTIES = 0x90ca, AF_CAPTURE_IN_RAM, CAPTURE_IN_MEDIA = 0x9207
+    GET_VENDOR_PROPERTIES = 0x90ca, AF_CAPTURE_IN_RAM, START_LIVE_VIEW = 0x9201, END_LIVE_VIEW, CAPTURE_IN_MEDIA = 0x9207
 };
+
+enum { LIVE_VIEW_STATUS = 0xd1a2 };
 
 static uint16_t delete_ram(struct body *b, uint32_t handle)
 {
@@ -15,6 +17,14 @@ static uint16_t delete_ram(struct body *b, uint32_t handle)
         if (b->object[i].in_ram && (!handle || b->object[i].handle == handle))
             code = body_delete(b, b->object[i].handle);
     return code;
+}
+
+// Mirror and display only: there are no pictures of it.
+static void show_live_view(struct body *b, bool on)
+{
+    for (int i = 0; i < b->personality->n_properties; i++)
+        if (b->personality->property[i].code == LIVE_VIEW_STATUS)
+            b->value[i] = on;
 }
 
 bool ptp_nikon_answer(struct ptp_session *s, const struct ptp_request *q, struct ptp_reply *reply)
@@ -31,6 +41,10 @@ bool ptp_nikon_answer(struct ptp_session *s, const struct ptp_request *q, struct
         return true;
     case AF_DRIVE:
     case CHANGE_CAMERA_MODE:
+        return true;
+    case START_LIVE_VIEW:
+    case END_LIVE_VIEW:
+        show_live_view(b, q->code == START_LIVE_VIEW);
         return true;
     case DELETE_RAM_IMAGE:
         reply->code = delete_ram(b, q->param[0]);
