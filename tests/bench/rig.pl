@@ -5,7 +5,8 @@
 #   rig.pl faults [PAIRS [WHICH]] one of 12 cameras misbehaves: when is it back or out, what do the others notice
 #   rig.pl soak [N]               N takes: descriptors, memory, processes
 #   rig.pl lag                    calibration against the wires' truth
-#   rig.pl full                   the disk fills in the middle of a take, and fails (EIO) in the middle of another (root: tmpfs)
+#   rig.pl full                   the disk fills in the middle of a take (a small tmpfs: needs root)
+#   rig.pl eio                    the disk fails in the middle of a take
 # Environment: BIN (build/bin), TMPDIR (a folder on the disk to be measured; kills and faults prefer /dev/shm), SEED, KEEP=1 keeps
 # the folders. Plain Perl, nothing beyond Debian's perl; gphoto2 for kills. Exit 1: a promise was broken.
 use strict;
@@ -58,7 +59,7 @@ sub end {
     delete $children{$pid};
 }
 
-my $next_port = 22000 + $$ % 500 * 40;
+my $next_port = 20000 + $$ % 250 * 48; # below those that the kernel gives to clients
 
 # cameras, personality, raw (WxH), set [...], faults (text), rig (lines of [rig]), trigger (lines), takes (folder), sections (sub: edits the list)
 sub new_rig {
@@ -190,7 +191,10 @@ sub kill_instance {
         my ($m) = @_;
         if ($m->{event} eq 'state') {
             my $take = $m->{body}{take};
-            $own{$take} = 1 if $m->{body}{state} eq 'preflight';
+            if ($m->{body}{state} eq 'preflight') {
+                $own{$take} = 1;
+                $r->{take_began} = now();
+            }
             $phase = $own{$take} ? $m->{body}{state} : 'resume';
         } elsif ($m->{event} eq 'take') {
             $phase = 'idle';
@@ -202,11 +206,14 @@ sub kill_instance {
     ready($r) or die "instance $instance does not come up\n";
     my ($k, $n_daemon, $n_worker, $quarantines) = (0, 0, 0, 0);
     while ($k < $n) {
-        # mostly somewhere in a take or in the recovery; one in five at once after the last one
-        my $wait = rand() < .2 ? rand(.25) : rand(2.2);
-        my $end = now() + $wait;
+        # one in five at once after the last one, one in five wherever it then is, the others somewhere in the next take
+        my $die = rand();
+        my $end = now() + ($die < .2 ? rand(.25) : $die < .4 ? rand(2.2) : 20);
+        $r->{take_began} = undef;
+        my $into = rand(1.5);
         while ((my $left = $end - now()) > 0) {
             listen_for($r, min($left, .05));
+            $end = min($end, $r->{take_began} + $into) if $die >= .4 && $r->{take_began};
             if ($capturing && $r->{answers}{$capturing}) { # refused (busy with a resume) or done: again
                 my $a = delete $r->{answers}{$capturing};
                 $phase = 'resume' if $phase eq 'start' && !$a->{ok} && $a->{error}{code} eq 'busy';
@@ -485,7 +492,7 @@ sub fault_pair {
     my @others = grep { $_ ne $victim } keys %with;
     my @told = grep { $_->{event} eq 'say' && ($_->{body}{camera} // '') eq $victim } @events;
     my ($quarantine) = grep { $_->{body}{text} =~ /quarantined/ } @told;
-    my ($text) = map { $_->{body}{text} } grep { $_->{body}{severity} ne 'info' } reverse @told;
+    my ($text) = map { $_->{body}{text} } grep { $_->{body}{severity} ne 'info' && $_->{body}{text} !~ /its shutter opened more/ } reverse @told;
     my ($out) = grep { $_->{camera} eq $victim } @{$t->{left_out} // []}, @{$t->{missing} // []};
     $text //= "camera $out->{camera} ($out->{port}): $out->{note}" if $out;
     my ($outcome, $s) = $quarantine ? ('quarantined', $quarantine->{at} - $t0) : $out ? ($before ? 'left out' : 'reported', $answered - $t0) : defined $with{$victim} ? ('delivered', $answered - $t0) : ('?', $answered - $t0);
@@ -616,7 +623,7 @@ sub lag {
 # Every file under its final name is whole: a TIFF that LibRaw's size agrees with is not asked for, only the size that all share.
 sub partial_frames {
     my ($r) = @_;
-    my @sizes = map { -s $_ // 0 } glob "$r->{takes}/*/raw/*";
+    my @sizes = map { -s $_ // 0 } grep { !/\.part/ } glob "$r->{takes}/*/raw/*";
     my $whole = max(0, @sizes);
     scalar grep { $_ < $whole - 4096 } @sizes;
 }
@@ -667,11 +674,14 @@ sub full {
     $broken ||= !$ok;
     end($_, 'KILL') for keys %children;
     system('umount', $takes);
+}
 
+sub eio {
+    my $cameras = 8;
     my $dir = folder(1);
     system($ENV{CC} // 'cc', '-shared', '-fPIC', '-O', '-o', "$dir/failing_disk.so", 'tests/bench/failing_disk.c', '-ldl') == 0 or die;
-    for my $after_ms (0, 30, 100, 300) {
-        my $r = new_rig(ram => 1, cameras => $cameras, trigger => "half_press_ms = 60\nhold_ms = 100", env => { LD_PRELOAD => "$dir/failing_disk.so", DISK_FAILS => "$dir/fails" });
+    for my $after_ms (0, 300) {
+        my $r = new_rig(ram => 1, cameras => $cameras, faults => "A* at 0s slow 400000\n", trigger => "half_press_ms = 60\nhold_ms = 100", env => { LD_PRELOAD => "$dir/failing_disk.so", DISK_FAILS => "$dir/fails" });
         start_rigd($r);
         ready($r) or die "does not come up\n";
         my ($at, $partial, $failing) = (undef, 0, 0);
@@ -691,12 +701,13 @@ sub full {
         my $again = $first eq 'verified' ? $a : request($r, 'resume', take => $a->{result}{id});
         my $whole = $again->{ok} && request($r, 'export', take => $again->{result}{id})->{result}{intact};
         printf "EIO %d ms after the shots are collected: %s after %.1f s%s\n", $after_ms, $first, $answer_s, $first eq 'failed' ? " ($a->{result}{reason})" : '';
+        print "    partial $partial, frames $again->{result}{n_frames}, manifest ", $whole ? 'intact' : 'not intact', "\n";
         promise(!$partial && ($again->{result}{state} // '') eq 'verified' && $again->{result}{n_frames} == $cameras && $whole && !`find $r->{takes} -name '*.part*'`, "EIO after $after_ms ms: nothing partial, then all $cameras frames, manifest intact");
         stop($r);
     }
 }
 
-my %commands = (kills => \&kills, scale => \&scale, faults => \&faults, soak => \&soak, lag => \&lag, full => \&full);
+my %commands = (kills => \&kills, scale => \&scale, faults => \&faults, soak => \&soak, lag => \&lag, full => \&full, eio => \&eio);
 my $what = shift // '';
 $SIG{INT} = $SIG{TERM} = sub { exit 2 };
 my $main = $$;
