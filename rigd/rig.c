@@ -250,6 +250,16 @@ static const char *remedy(enum camera_trouble trouble)
     }
 }
 
+// Found, then what to do about it: where both do not fit, what was found is cut.
+static void explain(char why[200], const char *found, const char *to_do)
+{
+    const int room = 199 - (int)strlen(to_do) - 2, n = (int)strlen(found);
+    if (n <= room)
+        snprintf(why, 200, "%s; %s", found, to_do);
+    else
+        snprintf(why, 200, "%.*s...; %s", room - 3, found, to_do);
+}
+
 // Before the shot: this body takes no part. After it: its frames are missed, for now.
 static void give_up(struct rig *r, int i, const char *why)
 {
@@ -400,6 +410,13 @@ static void begin_reconcile(struct rig *r, int i, int64_t now)
     memcpy(b->cursor, c->before, sizeof(b->cursor));
     if (!b->owed_due_ns)
         b->owed_due_ns = now + RECONCILE_MS * MS;
+}
+
+// What it announced was lost with its connection: to wait for that would be in vain.
+static void collect_from_card(struct rig *r, int i, int64_t now)
+{
+    r->body[i].owed_due_ns = now + (RECONCILE_MS + r->config->collect_timeout_ms) * MS;
+    begin_reconcile(r, i, now);
 }
 
 // Everything this body owes is here?
@@ -633,6 +650,11 @@ static void trouble(struct rig *r, int i, int64_t now, enum camera_command_kind 
         b->thumbed = true; // a preview is not worth a second crash
     if (suspect == CAMERA_THUMBNAIL || suspect == CAMERA_IDENTIFY || suspect == CAMERA_TRIGGER)
         suspect = CAMERA_OPEN; // not tried again: reopening is all the proof there will be
+    if (b->step == STEP_COLLECT && r->purpose != FOR_LAG) {
+        collect_from_card(r, i, now);
+        if (suspect == CAMERA_COLLECT)
+            suspect = CAMERA_LIST;
+    }
     if (!b->trouble_ns) {
         b->trouble_ns = now;
         b->rung = 0;
@@ -900,8 +922,10 @@ static void begin_collect(struct rig *r, int64_t now)
 {
     r->phase = PHASE_COLLECT;
     for (int i = 0; i < r->n; i++)
-        if (r->body[i].part)
+        if (r->body[i].part && r->body[i].condition == RIG_READY)
             set_step(r, i, STEP_COLLECT);
+        else if (r->body[i].part && r->purpose == FOR_TAKE)
+            collect_from_card(r, i, now);
     if (r->purpose == FOR_TAKE)
         set_state(r, TAKE_COLLECTING);
     for (int i = 0; i < r->n; i++) // who fell into quarantine while all was silent
@@ -1235,8 +1259,9 @@ static void busy(struct rig *r, int i, int64_t now, const struct camera_event *e
     const int64_t wait = (INT64_C(50) << (b->n_busy < 5 ? b->n_busy : 5)) * MS;
     b->n_busy++;
     if (now + wait - b->busy_since_ns > BUSY_MS * MS) {
-        char why[200];
-        snprintf(why, sizeof(why), "busy for %.1f s (%s): %.80s; %s", 1e-9 * (double)(now - b->busy_since_ns), camera_command_name(e->command), e->text, remedy(CAMERA_BUSY));
+        char found[300], why[200];
+        snprintf(found, sizeof(found), "busy for %.1f s (%s): %s", 1e-9 * (double)(now - b->busy_since_ns), camera_command_name(e->command), e->text);
+        explain(why, found, remedy(CAMERA_BUSY));
         b->busy_since_ns = 0;
         quarantine(r, i, now, why);
         return;
@@ -1248,8 +1273,9 @@ static void busy(struct rig *r, int i, int64_t now, const struct camera_event *e
 static void failed_softly(struct rig *r, int i, int64_t now, const struct camera_event *e, int k)
 {
     struct body *b = &r->body[i];
-    char why[200];
-    snprintf(why, sizeof(why), "%s: %.90s; %.90s", camera_command_name(e->command), e->text, remedy(e->trouble));
+    char found[300], why[200];
+    snprintf(found, sizeof(found), "%s: %s", camera_command_name(e->command), e->text);
+    explain(why, found, remedy(e->trouble));
     switch (e->command) {
     case CAMERA_THUMBNAIL:
         b->thumbed = true; // a preview is not worth a second try
@@ -1328,11 +1354,12 @@ void rig_camera_event(struct rig *r, int64_t now, int i, const struct camera_eve
             busy(r, i, now, e);
         } else if (e->trouble == CAMERA_WRONG) {
             char why[200];
-            snprintf(why, sizeof(why), "%.120s; %s", e->text, remedy(CAMERA_WRONG));
+            explain(why, e->text, remedy(CAMERA_WRONG));
             quarantine(r, i, now, why);
         } else if (e->trouble == CAMERA_LOST || e->trouble == CAMERA_STALLED || e->trouble == CAMERA_BROKEN) {
-            char why[200];
-            snprintf(why, sizeof(why), "%s, %s: %.90s; %s", camera_command_name(kind), camera_trouble_name(e->trouble), e->text, remedy(e->trouble));
+            char found[300], why[200];
+            snprintf(found, sizeof(found), "%s, %s: %s", camera_command_name(kind), camera_trouble_name(e->trouble), e->text);
+            explain(why, found, remedy(e->trouble));
             trouble(r, i, now, kind, why);
         } else {
             failed_softly(r, i, now, e, k);
