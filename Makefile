@@ -106,7 +106,7 @@ $(BUILD)/tests/test_camera_worker $(BUILD)/tests/test_config $(BUILD)/tests/test
 $(BUILD)/tests/bench/stability_joint: $(call object,solver/commands/arguments.c)
 $(BUILD)/obj/tests/test_usb_camera.o $(BUILD)/obj/tests/usb/usb_camera.o: CFLAGS_ALL += $(shell pkg-config --cflags umockdev-1.0 2>/dev/null)
 $(BUILD)/tests/test_usb_camera: LIBS += $(shell pkg-config --libs umockdev-1.0 2>/dev/null)
-$(BUILD)/tests/test_usb_camera: | $(BUILD)/bin/rigd-camera
+$(BUILD)/tests/test_usb_camera: | $(BUILD)/bin/rigd $(BUILD)/bin/rigd-camera
 $(BUILD)/tests/test_pcg: LIBS += $(if $(wildcard /usr/include/suitesparse/cholmod.h),-lcholmod)
 $(BUILD)/fuzz/obj/%.o: %.c Makefile | deps-fuzz
 	@mkdir -p $(@D)

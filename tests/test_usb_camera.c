@@ -18,6 +18,7 @@ int main(void)
 
 #include <errno.h>
 #include <fcntl.h>
+#include <glob.h>
 #include <poll.h>
 #include <signal.h>
 #include <string.h>
@@ -373,6 +374,58 @@ static void stock_gphoto2_finds_it_and_captures(void **state)
     unlink(scratch_path("stock.dng"));
 }
 
+// One program after the other as a user starts them, with the cable pulled in the middle of the download.
+static void a_take_of_the_daemon_survives_a_pulled_cable(void **state)
+{
+    (void)state;
+    char command[1600], hash[DIGEST_HEX], on_disk[DIGEST_HEX], pattern[700], here[300];
+    const char *folder = getenv("BIN") ? getenv("BIN") : "build/bin";
+    int64_t size, size_on_disk;
+    int status;
+    allow_leaks_of_the_driver();
+    assert_non_null(getcwd(here, sizeof(here)));
+    plug_in(nikon);
+    FILE *f = fopen(scratch_path("rigd.conf"), "w");
+    assert_non_null(f);
+    fprintf(f, "[rig]\ntakes = %s/takes\nstate = %s/takes\nsocket = %s/s\npersonality_dir = %s/config/cameras\nraw_mb = 2\nfree_space_mb = 1\nthumbnails = no\n[trigger]\nkind = software\n"
+               "[camera \"A01\"]\nserial = %s\nport = usb:%s\npersonality = nikon\n",
+            scratch_dir, scratch_dir, scratch_dir, here, nikon->serial, USB_CAMERA_SLOT);
+    assert_int_equal(fclose(f), 0);
+    snprintf(command, sizeof(command), "exec %s/rigd --config '%s' --once >'%s' 2>&1", folder, scratch_path("rigd.conf"), scratch_path("log"));
+    usb_camera_pause_after(camera, 1 << 20);
+    const pid_t pid = fork();
+    assert_true(pid >= 0);
+    if (!pid) {
+        prctl(PR_SET_PDEATHSIG, SIGKILL);
+        execl("/bin/sh", "sh", "-c", command, NULL);
+        _exit(127);
+    }
+    const bool is_halfway = usb_camera_wait_paused(camera, 15000);
+    if (is_halfway) {
+        usb_camera_unplug(camera);
+        assert_int_equal(usb_camera_plug(camera, 5), 0);
+    } else {
+        kill(pid, SIGTERM);
+    }
+    assert_int_equal(waitpid(pid, &status, 0), pid);
+    if (!is_halfway || status) {
+        snprintf(command, sizeof(command), "tail -20 '%s' >&2", scratch_path("log"));
+        status = system(command) | 1;
+    }
+    assert_int_equal(status, 0);
+    assert_int_equal(usb_camera_digest(camera, "DSC_0001.DNG", hash, &size), 0);
+    snprintf(pattern, sizeof(pattern), "%s/takes/*/*/A01*", scratch_dir);
+    glob_t found;
+    assert_int_equal(glob(pattern, 0, NULL, &found), 0);
+    assert_int_equal(found.gl_pathc, 1);
+    assert_int_equal(digest_file(found.gl_pathv[0], 0, on_disk, &size_on_disk), 0);
+    assert_string_equal(on_disk, hash);
+    globfree(&found);
+    snprintf(command, sizeof(command), "rm -r '%s'", scratch_path("takes"));
+    assert_int_equal(system(command), 0);
+    scratch_empty();
+}
+
 static void assert_finding(const struct json *report, const char *about, const char *severity, const char *words)
 {
     const int n = json_length(report, "findings");
@@ -482,6 +535,7 @@ int main(int argc, char **argv)
         cmocka_unit_test_teardown(after_a_killed_worker_the_next_one_fetches_the_frame, unplug),
         cmocka_unit_test_teardown(a_camera_that_another_program_holds_is_said_to_be_held, unplug),
         cmocka_unit_test_teardown(stock_gphoto2_finds_it_and_captures, unplug),
+        cmocka_unit_test_teardown(a_take_of_the_daemon_survives_a_pulled_cable, unplug),
         cmocka_unit_test_teardown(doctor_warns_of_thirty_cameras_on_one_controller, unplug),
     };
     begin_anew(argv);

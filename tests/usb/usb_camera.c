@@ -27,7 +27,8 @@ struct usb_camera {
     UMockdevTestbed *bed;
     UMockdevIoctlBase *handler;
     pthread_mutex_t lock;
-    pthread_cond_t paused_now;
+    pthread_cond_t changed; // paused, n_clients
+    int n_clients; // that have it open
     struct ptp_usb ptp;
     struct urb urb[URBS_MAX]; // in the order of submission
     int n_urbs;
@@ -164,7 +165,7 @@ static void transfer(struct usb_camera *c, UMockdevIoctlClient *client)
         } else if (raw(u)->endpoint == BULK_IN && !bulk_waits) {
             if (c->count.bytes_in >= c->pause_at && ptp_usb_left(&c->ptp) && !c->paused) {
                 c->paused = true;
-                pthread_cond_broadcast(&c->paused_now);
+                pthread_cond_broadcast(&c->changed);
             }
             uint8_t *bytes = c->paused ? NULL : malloc((size_t)raw(u)->buffer_length + 1);
             const int n = bytes ? ptp_usb_read(&c->ptp, bytes, (size_t)raw(u)->buffer_length) : -EAGAIN;
@@ -298,13 +299,19 @@ static void on_gone(gpointer arg, GObject *client)
             drop_urb(c, i);
     if ((GObject *)c->claimed_by == client)
         c->claimed_by = NULL;
+    c->n_clients--;
+    pthread_cond_broadcast(&c->changed);
     pthread_mutex_unlock(&c->lock);
 }
 
 static void on_connected(UMockdevIoctlBase *handler, UMockdevIoctlClient *client, gpointer arg)
 {
+    struct usb_camera *c = arg;
     (void)handler;
-    g_object_weak_ref(G_OBJECT(client), on_gone, arg);
+    pthread_mutex_lock(&c->lock);
+    c->n_clients++;
+    pthread_mutex_unlock(&c->lock);
+    g_object_weak_ref(G_OBJECT(client), on_gone, c);
 }
 
 static void bus_reset(struct usb_camera *c)
@@ -399,7 +406,7 @@ int usb_camera_new(struct usb_camera **out, UMockdevTestbed *bed, const struct p
         return err;
     }
     pthread_mutex_init(&c->lock, NULL);
-    pthread_cond_init(&c->paused_now, NULL);
+    pthread_cond_init(&c->changed, NULL);
     c->pause_at = UINT64_MAX;
     c->bed = bed;
     c->handler = umockdev_ioctl_base_new();
@@ -415,6 +422,16 @@ void usb_camera_free(struct usb_camera *c)
         return;
     if (c->path)
         usb_camera_unplug(c);
+    const struct timespec until = { clock_ns(CLOCK_REALTIME) / 1000000000 + 5, 0 };
+    pthread_mutex_lock(&c->lock);
+    while (c->n_clients && !pthread_cond_timedwait(&c->changed, &c->lock, &until))
+        continue;
+    const bool is_held = c->n_clients;
+    pthread_mutex_unlock(&c->lock);
+    if (is_held) {
+        log_error("usb_camera: a program still has it open: it is left as it is");
+        return;
+    }
     g_object_unref(c->handler);
     while (c->n_urbs)
         drop_urb(c, c->n_urbs - 1);
@@ -519,7 +536,7 @@ bool usb_camera_wait_paused(struct usb_camera *c, int timeout_ms)
     const int64_t until = clock_ns(CLOCK_REALTIME) + (int64_t)timeout_ms * 1000000;
     const struct timespec t = { until / 1000000000, until % 1000000000 };
     pthread_mutex_lock(&c->lock);
-    while (!c->paused && !pthread_cond_timedwait(&c->paused_now, &c->lock, &t))
+    while (!c->paused && !pthread_cond_timedwait(&c->changed, &c->lock, &t))
         continue;
     const bool paused = c->paused;
     pthread_mutex_unlock(&c->lock);

@@ -20,6 +20,7 @@ struct usb_camera_count {
 
 // Unplugged. personality and scene stay the caller's. 0, -ENOMEM.
 int usb_camera_new(struct usb_camera **out, UMockdevTestbed *bed, const struct personality *personality, struct scene *scene);
+// Waits for programs that had it open and have ended.
 void usb_camera_free(struct usb_camera *c);
 // The root hub and the hub that it hangs on are there before the first camera and stay. 0, -EINVAL (umockdev's words are logged).
 int usb_camera_plug(struct usb_camera *c, int device_number);
