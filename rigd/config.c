@@ -635,14 +635,29 @@ fail:
     return err;
 }
 
+// cameras/ beside rigd.conf; without one, what was installed with this program (PREFIX/bin/rigd, PREFIX/share/...).
+static void find_personality_dir(struct config *c, const char *path)
+{
+    char program[200];
+    const char *slash = strrchr(path, '/');
+    snprintf(c->personality_dir, sizeof(c->personality_dir), "%.*scameras", slash ? (int)(slash - path) + 1 : 0, path);
+    const ssize_t n = access(c->personality_dir, R_OK) ? readlink("/proc/self/exe", program, sizeof(program) - 1) : -1;
+    if (n <= 0)
+        return;
+    program[n] = 0;
+    *strrchr(program, '/') = 0;
+    char installed[sizeof(program) + 40];
+    snprintf(installed, sizeof(installed), "%s/../share/studiorig/config/cameras", program);
+    if (!access(installed, R_OK) && strlen(installed) < sizeof(c->personality_dir))
+        strcpy(c->personality_dir, installed);
+}
+
 // personality = nikon  ->  <personality_dir>/nikon.conf, which must be there.
 static int find_personalities(struct config *c, const char *path)
 {
     int err = 0;
-    if (!c->personality_dir[0]) {
-        const char *slash = strrchr(path, '/');
-        snprintf(c->personality_dir, sizeof(c->personality_dir), "%.*scameras", slash ? (int)(slash - path) + 1 : 0, path);
-    }
+    if (!c->personality_dir[0])
+        find_personality_dir(c, path);
     for (int i = 0; i < c->n_cameras; i++) {
         struct config_camera *k = &c->camera[i];
         char file[sizeof(k->personality)];

@@ -13,7 +13,7 @@ struct config_camera {       // [camera "A01"]
     char serial[40];         // "" : any body (a warning of preflight)
     char port[96];           // usb:1-4.3 | ptpip:HOST:PORT:EVENTPORT
     char model[64];          // driver's name of the body; "" by detection
-    char personality[256];   // path of config/cameras/NAME.conf, beside rigd.conf or in personality_dir; "" none
+    char personality[256];   // path of NAME.conf: in personality_dir, else in cameras/ beside rigd.conf, else as installed; "" none
     char lens[64];           // as the body reports it, "": not checked
     int full_line, half_line; // trigger channels of this body alone; CONFIG_NONE: it hangs on the common lines
     int feedback_line;       // flash-sync input; CONFIG_NONE

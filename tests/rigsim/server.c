@@ -408,8 +408,10 @@ static void accept_link(struct camera *c, unsigned k)
 void server_step_camera(struct camera *c)
 {
     struct body_event e;
-    do {
-        body_step(&c->body, c->server->now_ns);
+    for (bool more = true; more;) { // one by one, however late: what the script does at an exposure's end comes before the file's event
+        const int64_t next_ns = body_next_ns(&c->body);
+        more = next_ns <= c->server->now_ns;
+        body_step(&c->body, more ? next_ns : c->server->now_ns);
         while (body_take_event(&c->body, &e)) {
             struct ptp_event wire;
             if (e.kind == BODY_EXPOSED) {
@@ -421,7 +423,7 @@ void server_step_camera(struct camera *c)
             const struct ptpip_packet p = { .type = PTPIP_EVENT, .code = wire.code, .n_params = 1, .param = { wire.param } };
             send_packet(c, c->event, &p);
         }
-    } while (body_next_ns(&c->body) <= c->server->now_ns);
+    }
 }
 
 // Whatever waited for time: an answer, bytes of a slow link.
