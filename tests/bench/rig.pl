@@ -8,7 +8,8 @@
 #   rig.pl full                   the disk fills in the middle of a take (a small tmpfs: needs root)
 #   rig.pl eio                    the disk fails in the middle of a take
 # Environment: BIN (build/bin), TMPDIR (a folder on the disk to be measured; kills and faults prefer /dev/shm), SEED, KEEP=1 keeps
-# the folders. Plain Perl, nothing beyond Debian's perl; gphoto2 for kills. Exit 1: a promise was broken.
+# the folders; ASCMHL="ascmhl-debug verify" lets the reference tool look at 20 manifests, too. Plain Perl, nothing beyond Debian's
+# perl; gphoto2 for kills. Exit 1: a promise was broken.
 use strict;
 use warnings;
 use Cwd qw(abs_path);
@@ -307,6 +308,9 @@ sub audit {
             }
             my $x = request($r, 'export', take => $id);
             $x && $x->{ok} && $x->{result}{intact} ? $manifests++ : $complain->("$id: its manifest does not verify");
+            if ($ENV{ASCMHL} && $account->{reference}++ < 20 && system("$ENV{ASCMHL} '$t' >$r->{dir}/reference.log 2>&1")) {
+                $complain->("$id: '$ENV{ASCMHL}' finds fault: " . slurp("$r->{dir}/reference.log"));
+            }
         }
     }
     chomp(my @parts = `find $r->{takes} -name '*.part*' -o -name '.*' -type f`);
