@@ -536,7 +536,8 @@ sub faults {
 
 sub soak {
     my $n = shift // 200;
-    my $r = new_rig(ram => 1, cameras => 8, trigger => "half_press_ms = 60\nhold_ms = 100");
+    # Frames are deleted from the cards: libgphoto2 remembers each file on a card, and memory would grow with those.
+    my $r = new_rig(ram => 1, cameras => 8, trigger => "half_press_ms = 60\nhold_ms = 100", rig => "raw_mb = 1\nfree_space_mb = 1\ndelete_after_verify = yes\n");
     start_rigd($r);
     ready($r) or die "does not come up\n";
     my $fds = sub { my ($pid) = @_; my @f = glob "/proc/$pid/fd/*"; scalar @f };
