@@ -547,7 +547,7 @@ int main(int argc, char **argv)
         printf("1..0 # SKIP umockdev's library cannot be preloaded here (under a sanitizer that is linked statically?)\n");
         return 0;
     }
-    if (!nikon || !generic || personality_read(nikon, "nikon") || personality_read(generic, "generic") || scene_open(&scene, NULL, 1224, 816, 1, no_name) || scratch_open())
+    if (!nikon || !generic || personality_load(nikon, "nikon") || personality_load(generic, "generic") || scene_open(&scene, NULL, 1224, 816, 1, no_name) || scratch_open())
         return 1;
     const int failed = cmocka_run_group_tests_name("usb_camera", tests, NULL, NULL);
     scratch_empty();
