@@ -366,6 +366,19 @@ static void close_leftover_links(struct gphoto *g)
     g->n_links = 0;
 }
 
+// Nor does it close the device of a claim that failed, or of a body that was pulled out. Its library's context is gone when this is called.
+static void close_leftover_devices(void)
+{
+    for (int fd = CAMERA_FD + 1; fd < 256; fd++) {
+        char link[32], path[256];
+        snprintf(link, sizeof(link), "/proc/self/fd/%d", fd);
+        const ssize_t n = readlink(link, path, sizeof(path) - 1);
+        path[n > 0 ? n : 0] = 0;
+        if (strstr(path, "/dev/bus/usb/"))
+            close(fd);
+    }
+}
+
 static void disconnect(struct gphoto *g)
 {
     if (g->broken) { // saying goodbye would wait for every answer
@@ -387,6 +400,7 @@ void gphoto_close(struct gphoto *g)
         disconnect(g);
     gp_camera_unref(g->camera);
     close_leftover_links(g);
+    close_leftover_devices();
     g->camera = NULL;
 }
 

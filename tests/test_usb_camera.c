@@ -330,6 +330,20 @@ static void after_a_killed_worker_the_next_one_fetches_the_frame(void **state)
     worker_stop(&w);
 }
 
+// How many descriptors the worker has on USB devices.
+static int open_devices(const struct worker *w)
+{
+    char name[64], target[600];
+    int n = 0;
+    for (int fd = 0; fd < 256; fd++) {
+        snprintf(name, sizeof(name), "/proc/%d/fd/%d", (int)w->pid, fd);
+        const ssize_t length = readlink(name, target, sizeof(target) - 1);
+        target[length > 0 ? length : 0] = 0;
+        n += strstr(target, "/dev/bus/usb/") != NULL;
+    }
+    return n;
+}
+
 static void a_camera_that_another_program_holds_is_said_to_be_held(void **state)
 {
     (void)state;
@@ -341,6 +355,8 @@ static void a_camera_that_another_program_holds_is_said_to_be_held(void **state)
     done(&first, opening("nikon"));
     fails(&second, opening("nikon"), CAMERA_LOST, "another program holds");
     assert_int_equal(second.answer.err, -EBUSY);
+    assert_true(open_devices(&first) > 0);
+    assert_int_equal(open_devices(&second), 0); // a retry a minute would use up all descriptors
     done(&first, plain(CAMERA_CLOSE));
     done(&second, opening("nikon"));
     worker_stop(&first);
