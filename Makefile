@@ -12,7 +12,7 @@ MACHINE := $(shell uname -m)
 
 # ---- packages (Debian 12; the same names in Debian 13) ----------------------------------------------------------------
 PACKAGES := gcc make pkg-config libopenexr-dev libembree-dev libassimp-dev libjansson-dev libtiff-dev libpng-dev libjpeg-dev libexpat1-dev liblapacke-dev libopenblas-dev libcmocka-dev perl help2man \
-  libgphoto2-dev libgpiod-dev libinih-dev libsystemd-dev libxxhash-dev
+  libgphoto2-dev libgpiod-dev libinih-dev libsystemd-dev libumockdev-dev libxxhash-dev
 PACKAGES_FUZZ := clang libclang-rt-dev
 PACKAGES_BENCH := libceres-dev g++ gnuplot-nox
 
@@ -47,10 +47,10 @@ FUZZED := $(LIBRARY) $(RIG) $(RIGSIM_LIB) # what a fuzzer calls of these is link
 
 # ---- rules --------------------------------------------------------------------------------------------------------------
 object = $(patsubst %.c,$(BUILD)/obj/%.o,$(1))
-ifneq ($(filter test test-vm demo bench chart figure5 figures stability experiments,$(MAKECMDGOALS)),)
+ifneq ($(filter test test-vm demo bench bench-rig chart figure5 figures stability experiments,$(MAKECMDGOALS)),)
 FIRST := deps # these install what is missing before the first file is compiled
 endif
-.PHONY: all deps deps-fuzz deps-bench test test-vm demo bench chart figure5 figures stability experiments fuzz check-includes man install clean help
+.PHONY: all deps deps-fuzz deps-bench test test-vm demo bench bench-rig chart figure5 figures stability experiments fuzz check-includes man install clean help
 .DELETE_ON_ERROR:
 .SECONDARY:
 
@@ -94,7 +94,7 @@ $(BUILD)/bin/rigsim: $(call object,$(filter-out %/client.c,$(RIGSIM))) $(BUILD)/
 	@mkdir -p $(@D)
 	@$(if $(V),,echo '  LD $@')
 	$(Q)$(CC) $(CFLAGS_ALL) $^ $(LIBS) -o $@
-$(BUILD)/librigsim.a: $(call object,$(RIGSIM_LIB) tests/rigsim/client.c)
+$(BUILD)/librigsim.a: $(call object,$(RIGSIM_LIB) tests/rigsim/client.c $(wildcard tests/usb/*.c))
 	@rm -f $@
 	@$(if $(V),,echo '  AR $@')
 	$(Q)ar rcsD $@ $^
@@ -104,6 +104,9 @@ $(BUILD)/tests/%: $(BUILD)/obj/tests/%.o $(BUILD)/librigsim.a $(BUILD)/librig.a 
 	$(Q)$(CC) $(CFLAGS_ALL) -Wl,--as-needed $^ -lcmocka $(LIBS_RIG) $(LIBS) -o $@
 $(BUILD)/tests/test_camera_worker $(BUILD)/tests/test_config $(BUILD)/tests/test_rigsim_wire: | $(BUILD)/bin/rigd-camera $(BUILD)/bin/rigsim
 $(BUILD)/tests/bench/stability_joint: $(call object,solver/commands/arguments.c)
+$(BUILD)/obj/tests/test_usb_camera.o $(BUILD)/obj/tests/usb/usb_camera.o: CFLAGS_ALL += $(shell pkg-config --cflags umockdev-1.0 2>/dev/null)
+$(BUILD)/tests/test_usb_camera: LIBS += $(shell pkg-config --libs umockdev-1.0 2>/dev/null)
+$(BUILD)/tests/test_usb_camera: | $(BUILD)/bin/rigd $(BUILD)/bin/rigd-camera
 $(BUILD)/tests/test_pcg: LIBS += $(if $(wildcard /usr/include/suitesparse/cholmod.h),-lcholmod)
 $(BUILD)/fuzz/obj/%.o: %.c Makefile | deps-fuzz
 	@mkdir -p $(@D)
@@ -131,7 +134,7 @@ deps-bench: deps ; $(call install_packages,$(PACKAGES_BENCH))
 TEST_PROGRAMS := $(addprefix $(BUILD)/tests/,$(TESTS))
 TEST_SCRIPTS := $(wildcard tests/check_*.sh tests/test_*.sh)
 test: deps all $(TEST_PROGRAMS)
-	@CMOCKA_MESSAGE_OUTPUT=TAP BIN=$(BUILD)/bin prove --timer --merge --exec '' $(TEST_PROGRAMS) $(TEST_SCRIPTS)
+	@CMOCKA_MESSAGE_OUTPUT=TAP BIN=$(BUILD)/bin prove -j $(shell nproc) --timer --merge --exec '' $(TEST_PROGRAMS) $(TEST_SCRIPTS)
 test-vm: deps $(BUILD)/tests/vm/test_gpio_vm
 	@prove --timer --verbose --exec '' tests/vm/run.sh :: $(BUILD)/vm $(BUILD)/tests/vm/test_gpio_vm
 check-includes:
@@ -145,7 +148,7 @@ fuzz: deps deps-fuzz $(FUZZ_PROGRAMS)
 	@printf '%s\n' $(FUZZ_PROGRAMS) | xargs -P 2 -I{} sh tests/fuzz/run.sh {} $(FUZZ_SECONDS)
 
 # ---- demonstration, measurements ------------------------------------------------------------------------------------------
-demo: deps $(BUILD)/bin/rigsolve
+demo: deps all
 	@BIN=$(BUILD)/bin sh tests/demo.sh build/demo
 
 HAVE_CERES := $(wildcard /usr/include/ceres/jet.h)
@@ -155,6 +158,9 @@ $(BUILD)/tests/bench/bench_kernels: LIBS += $(if $(HAVE_CERES),-lstdc++)
 $(BUILD)/tests/bench/bench_kernels: $(if $(HAVE_CERES),$(BUILD)/obj/tests/bench/ceres_peer.o)
 bench: deps $(BENCH_PROGRAMS) $(BUILD)/bin/rigsolve
 	@for b in $(BENCHES); do echo "== bench_$$b"; $(BUILD)/tests/bench/bench_$$b || exit 1; done
+RIG_BENCHES ?= scale faults soak lag full eio kills
+bench-rig: deps all
+	@for b in $(RIG_BENCHES); do echo "== $$b"; BIN=$(BUILD)/bin perl tests/bench/rig.pl $$b || failed=1; done; [ -z "$$failed" ]
 experiments: deps $(BUILD)/bin/rigsolve $(BUILD)/tests/bench/judge
 	@BIN=$(BUILD)/bin JUDGE=$(BUILD)/tests/bench/judge sh tests/bench/experiments.sh
 chart: deps deps-bench $(BUILD)/tests/bench/chart_lights
@@ -212,6 +218,7 @@ help:
 	@echo 'make demo       a synthetic studio, end to end    make fuzz      libFuzzer on every parser (FUZZ_SECONDS=60)'
 	@echo 'make test-vm    GPIO on a simulated chip, in a virtual machine'
 	@echo 'make bench      seconds and errors of kernels     make chart     speed against accuracy      make stability  where it fails'
+	@echo 'make bench-rig  the rig with simulated cameras: kills, faults, scale, soak, lag, disks (half an hour; RIG_BENCHES="lag soak")'
 	@echo 'make install    DESTDIR= PREFIX=/usr/local        make deps      Debian packages             make clean'
 	@echo 'variants: VARIANT=debug|asan|tsan; V=1 shows commands'
 -include $(shell find $(BUILD)/obj $(BUILD)/fuzz -name '*.d' 2>/dev/null)

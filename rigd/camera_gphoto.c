@@ -668,7 +668,7 @@ int gphoto_open(struct gphoto *g, const struct camera_command *c, const struct p
     }
     if (got >= 0 && c->serial[0] && !is_serial(c->serial, e->facts.serial))
         got = gphoto_fail(e, CAMERA_WRONG, 0,
-                          "the body at %.40s has serial number %s, expected %s: plug in the right one, or change the configuration",
+                          "the body at %.40s has serial number %s, expected %s",
                           c->port, e->facts.serial[0] ? e->facts.serial : "(none)", c->serial);
     if (got >= 0)
         got = ask_body_once(g, "model", e->facts.model, sizeof(e->facts.model), e);

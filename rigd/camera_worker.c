@@ -154,7 +154,7 @@ static int disk_trouble(struct camera_event *e, int err, const char *path)
                        : err == -EIO ? "check that disk: rigctl doctor"
                        : err == -EEXIST ? "something else has that name: move it away"
                        : err == -EROFS || err == -EACCES || err == -EPERM ? "let rigd write there" : "see rigctl doctor";
-    return gphoto_fail(e, CAMERA_DISK, err, "cannot write %.100s: %s: %s", path, strerror(-err), what);
+    return gphoto_fail(e, CAMERA_DISK, err, "cannot write %.60s: %s: %s", strrchr(path, '/') ? strrchr(path, '/') + 1 : path, strerror(-err), what);
 }
 
 // A copy that a life before made and named, but did not speak of. 1: it is taken over, 0: there is none, < 0: trouble.

@@ -67,12 +67,12 @@ static void check_endpoints(struct examination *x)
     for (int i = 0; i < x->config->n_cameras; i++)
         n[x->config->camera[i].controller]++;
     for (int c = 1; c < 256; c++) {
-        const int endpoints = n[c] * ENDPOINTS_PER_CAMERA;
+        const int endpoints = n[c] * ENDPOINTS_PER_CAMERA, bus = c - 1; // config.c: 0 is no USB
         if (endpoints > ENDPOINTS_PER_CONTROLLER)
-            find(x, "error", "endpoints", "USB bus %d: %d cameras take %d endpoints, common controllers have %d (about %d cameras): move %d cameras to another controller card", c, n[c],
+            find(x, "error", "endpoints", "USB bus %d: %d cameras take %d endpoints, common controllers have %d (about %d cameras): move %d cameras to another controller card", bus, n[c],
                  endpoints, ENDPOINTS_PER_CONTROLLER, ENDPOINTS_PER_CONTROLLER / ENDPOINTS_PER_CAMERA, n[c] - ENDPOINTS_PER_CONTROLLER / ENDPOINTS_PER_CAMERA);
         else if (n[c])
-            find(x, "info", "endpoints", "USB bus %d: %d cameras, %d of about %d endpoints", c, n[c], endpoints, ENDPOINTS_PER_CONTROLLER);
+            find(x, "info", "endpoints", "USB bus %d: %d cameras, %d of about %d endpoints", bus, n[c], endpoints, ENDPOINTS_PER_CONTROLLER);
     }
 }
 

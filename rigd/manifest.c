@@ -409,6 +409,10 @@ int manifest_write(const char *dir, const struct manifest_known *known, int n_kn
             differs = true;
             log_error("manifest: %s/%s is gone since %s", dir, last.file[i].path, chain.generation[chain.n - 1].name);
         }
+    if (!now.n) { // a take that failed before the shot; the schema wants at least one file
+        err = differs ? -EBADMSG : 0;
+        goto done;
+    }
     FILE *out = open_memstream(&text, &n_text);
     if (!out) {
         err = -ENOMEM;

@@ -15,7 +15,8 @@ struct manifest_known {
 
 // Add a generation over all files in dir (known hashes are used where path and size agree; the rest is read). utc_s: now.
 // Files of the last generation whose hash changed or that are gone are reported and the generation says "failed" for them.
-// 0; -EBADMSG: written, but something differs from the last generation (logged); other -errno: nothing written (logged).
+// Nothing is written when there is no file: the schema wants one. 0; -EBADMSG: something differs from the last generation
+// (logged), and a new one says so; other -errno: nothing written (logged).
 int manifest_write(const char *dir, const struct manifest_known *known, int n_known, int64_t utc_s);
 
 struct manifest_findings { int n_files, n_changed, n_missing, n_new; };

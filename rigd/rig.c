@@ -23,7 +23,8 @@ enum {
     GRACE_MS = 1000,          // an answer may be so much later than the command's timeout
     GREETING_MS = 8000,       // from spawn to HELLO
     BUSY_MS = 5000,           // back-off in all
-    TROUBLE_MS = 15000,       // ladder in all
+    TROUBLE_MS = 15000,       // ladder in all, counted from
+    SILENCE_MS = 4000,        // when the command was sent that failed, but at most so long before it did: drivers wait 3 s for an answer
     POWER_OFF_MS = 1500, POWER_ON_MS = 2000, RELAY_OFF_MS = 2000, RELAY_ON_MS = 2500,
     REOPEN_MS = 1000,         // between tries when the ladder has no rung left
     QUARANTINE_MS = 60000,    // between tries from quarantine
@@ -54,6 +55,7 @@ struct body {
         bool on;
         enum camera_command_kind kind;
         int object;                 // FETCH, DELETE: which of the ledger's
+        int64_t since_ns;           // sent, or last PROGRESS
         int64_t due_ns, limit_ns;   // due moves on with PROGRESS, the limit does not
     } flight;
     uint32_t seq;
@@ -250,6 +252,16 @@ static const char *remedy(enum camera_trouble trouble)
     }
 }
 
+// Found, then what to do about it: where both do not fit, what was found is cut.
+static void explain(char why[200], const char *found, const char *to_do)
+{
+    const int room = 199 - (int)strlen(to_do) - 2, n = (int)strlen(found);
+    if (n <= room)
+        snprintf(why, 200, "%s; %s", found, to_do);
+    else
+        snprintf(why, 200, "%.*s...; %s", room - 3, found, to_do);
+}
+
 // Before the shot: this body takes no part. After it: its frames are missed, for now.
 static void give_up(struct rig *r, int i, const char *why)
 {
@@ -295,6 +307,7 @@ static struct camera_command *send(struct rig *r, int i, int64_t now, enum camer
     b->flight.on = true;
     b->flight.kind = kind;
     b->flight.object = -1;
+    b->flight.since_ns = now;
     b->flight.due_ns = b->flight.limit_ns = now + (timeout_ms + GRACE_MS) * MS;
     b->retry_ns = 0;
     return c;
@@ -400,6 +413,13 @@ static void begin_reconcile(struct rig *r, int i, int64_t now)
     memcpy(b->cursor, c->before, sizeof(b->cursor));
     if (!b->owed_due_ns)
         b->owed_due_ns = now + RECONCILE_MS * MS;
+}
+
+// What it announced was lost with its connection: to wait for that would be in vain.
+static void collect_from_card(struct rig *r, int i, int64_t now)
+{
+    r->body[i].owed_due_ns = now + (RECONCILE_MS + r->config->collect_timeout_ms) * MS;
+    begin_reconcile(r, i, now);
 }
 
 // Everything this body owes is here?
@@ -621,8 +641,8 @@ static void climb(struct rig *r, int i, int64_t now)
     pump(r, i, now);
 }
 
-// suspect: the command that failed; CAMERA_OPEN for a worker that died without one.
-static void trouble(struct rig *r, int i, int64_t now, enum camera_command_kind suspect, const char *text)
+// suspect: the command that failed; CAMERA_OPEN for a worker that died without one. since: its last sign of life
+static void trouble(struct rig *r, int i, int64_t now, int64_t since, enum camera_command_kind suspect, const char *text)
 {
     struct body *b = &r->body[i];
     if (b->condition == RIG_QUARANTINED)
@@ -633,8 +653,13 @@ static void trouble(struct rig *r, int i, int64_t now, enum camera_command_kind 
         b->thumbed = true; // a preview is not worth a second crash
     if (suspect == CAMERA_THUMBNAIL || suspect == CAMERA_IDENTIFY || suspect == CAMERA_TRIGGER)
         suspect = CAMERA_OPEN; // not tried again: reopening is all the proof there will be
+    if (b->step == STEP_COLLECT && r->purpose != FOR_LAG) {
+        collect_from_card(r, i, now);
+        if (suspect == CAMERA_COLLECT)
+            suspect = CAMERA_LIST;
+    }
     if (!b->trouble_ns) {
-        b->trouble_ns = now;
+        b->trouble_ns = since > now - SILENCE_MS * MS ? since : now - SILENCE_MS * MS;
         b->rung = 0;
         b->suspect = suspect;
         b->n_recoveries++;
@@ -900,8 +925,10 @@ static void begin_collect(struct rig *r, int64_t now)
 {
     r->phase = PHASE_COLLECT;
     for (int i = 0; i < r->n; i++)
-        if (r->body[i].part)
+        if (r->body[i].part && r->body[i].condition == RIG_READY)
             set_step(r, i, STEP_COLLECT);
+        else if (r->body[i].part && r->purpose == FOR_TAKE)
+            collect_from_card(r, i, now);
     if (r->purpose == FOR_TAKE)
         set_state(r, TAKE_COLLECTING);
     for (int i = 0; i < r->n; i++) // who fell into quarantine while all was silent
@@ -1235,8 +1262,9 @@ static void busy(struct rig *r, int i, int64_t now, const struct camera_event *e
     const int64_t wait = (INT64_C(50) << (b->n_busy < 5 ? b->n_busy : 5)) * MS;
     b->n_busy++;
     if (now + wait - b->busy_since_ns > BUSY_MS * MS) {
-        char why[200];
-        snprintf(why, sizeof(why), "busy for %.1f s (%s): %.80s; %s", 1e-9 * (double)(now - b->busy_since_ns), camera_command_name(e->command), e->text, remedy(CAMERA_BUSY));
+        char found[300], why[200];
+        snprintf(found, sizeof(found), "busy for %.1f s (%s): %s", 1e-9 * (double)(now - b->busy_since_ns), camera_command_name(e->command), e->text);
+        explain(why, found, remedy(CAMERA_BUSY));
         b->busy_since_ns = 0;
         quarantine(r, i, now, why);
         return;
@@ -1248,8 +1276,9 @@ static void busy(struct rig *r, int i, int64_t now, const struct camera_event *e
 static void failed_softly(struct rig *r, int i, int64_t now, const struct camera_event *e, int k)
 {
     struct body *b = &r->body[i];
-    char why[200];
-    snprintf(why, sizeof(why), "%s: %.90s; %.90s", camera_command_name(e->command), e->text, remedy(e->trouble));
+    char found[300], why[200];
+    snprintf(found, sizeof(found), "%s: %s", camera_command_name(e->command), e->text);
+    explain(why, found, remedy(e->trouble));
     switch (e->command) {
     case CAMERA_THUMBNAIL:
         b->thumbed = true; // a preview is not worth a second try
@@ -1261,7 +1290,7 @@ static void failed_softly(struct rig *r, int i, int64_t now, const struct camera
         say(r, RIG_WARNING, i, "%s", why);
         return;
     case CAMERA_OPEN:
-        trouble(r, i, now, CAMERA_OPEN, why);
+        trouble(r, i, now, b->flight.since_ns, CAMERA_OPEN, why);
         return;
     case CAMERA_STATUS:
         if (b->step == STEP_STATUS) {
@@ -1311,6 +1340,7 @@ void rig_camera_event(struct rig *r, int64_t now, int i, const struct camera_eve
     } else if (e->kind == CAMERA_PROGRESS) {
         if (e->size_bytes > b->bytes_now) { // only bytes count
             b->bytes_now = e->size_bytes;
+            b->flight.since_ns = now;
             b->flight.due_ns = now + PROGRESS_MS * MS < b->flight.limit_ns ? now + PROGRESS_MS * MS : b->flight.limit_ns;
         }
     } else {
@@ -1321,19 +1351,20 @@ void rig_camera_event(struct rig *r, int64_t now, int i, const struct camera_eve
             char why[120];
             snprintf(why, sizeof(why), "its worker answered %s to %s", camera_command_name(e->command), camera_command_name(kind));
             kill_worker(r, i);
-            trouble(r, i, now, kind, why);
+            trouble(r, i, now, b->flight.since_ns, kind, why);
         } else if (e->kind == CAMERA_DONE) {
             done(r, i, now, e, k);
         } else if (e->trouble == CAMERA_BUSY) {
             busy(r, i, now, e);
         } else if (e->trouble == CAMERA_WRONG) {
             char why[200];
-            snprintf(why, sizeof(why), "%.120s; %s", e->text, remedy(CAMERA_WRONG));
+            explain(why, e->text, remedy(CAMERA_WRONG));
             quarantine(r, i, now, why);
         } else if (e->trouble == CAMERA_LOST || e->trouble == CAMERA_STALLED || e->trouble == CAMERA_BROKEN) {
-            char why[200];
-            snprintf(why, sizeof(why), "%s, %s: %.90s; %s", camera_command_name(kind), camera_trouble_name(e->trouble), e->text, remedy(e->trouble));
-            trouble(r, i, now, kind, why);
+            char found[300], why[200];
+            snprintf(found, sizeof(found), "%s, %s: %s", camera_command_name(kind), camera_trouble_name(e->trouble), e->text);
+            explain(why, found, remedy(e->trouble));
+            trouble(r, i, now, b->flight.since_ns, kind, why);
         } else {
             failed_softly(r, i, now, e, k);
         }
@@ -1348,8 +1379,9 @@ void rig_worker_gone(struct rig *r, int64_t now, int i, const char *how)
 {
     struct body *b = &r->body[i];
     const bool expected = b->killing;
-    const enum camera_command_kind suspect = b->flight.on ? b->flight.kind : CAMERA_OPEN;
-    const bool copied = b->flight.on && is_copy(b->flight.kind);
+    const bool in_flight = b->flight.on;
+    const enum camera_command_kind suspect = in_flight ? b->flight.kind : CAMERA_OPEN;
+    const bool copied = in_flight && is_copy(b->flight.kind);
     flight_ends(r, b);
     b->worker = b->greeted = b->killing = false;
     b->press = false;
@@ -1360,7 +1392,7 @@ void rig_worker_gone(struct rig *r, int64_t now, int i, const char *how)
     } else {
         char why[200];
         snprintf(why, sizeof(why), "its worker ended (%.60s) during %s; %s", how, camera_command_name(suspect), remedy(CAMERA_BROKEN));
-        trouble(r, i, now, suspect, why);
+        trouble(r, i, now, in_flight ? b->flight.since_ns : now, suspect, why);
     }
     if (copied)
         copy_next(r, b->config->controller, now);
@@ -1374,7 +1406,7 @@ static void body_time(struct rig *r, int i, int64_t now)
     struct body *b = &r->body[i];
     if (b->worker && !b->greeted && !b->killing && now >= b->greet_due_ns) {
         kill_worker(r, i);
-        trouble(r, i, now, CAMERA_OPEN, "its worker does not start; look into the journal");
+        trouble(r, i, now, now, CAMERA_OPEN, "its worker does not start; look into the journal");
     }
     if (b->flight.on && now >= b->flight.due_ns) {
         const enum camera_command_kind kind = b->flight.kind;
@@ -1382,7 +1414,7 @@ static void body_time(struct rig *r, int i, int64_t now)
         char why[200];
         snprintf(why, sizeof(why), "no answer to %s in time; %s", camera_command_name(kind), remedy(CAMERA_STALLED));
         kill_worker(r, i);
-        trouble(r, i, now, kind, why);
+        trouble(r, i, now, b->flight.since_ns, kind, why);
         if (copy)
             copy_next(r, b->config->controller, now);
     }

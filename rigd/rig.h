@@ -11,8 +11,8 @@
 //    it is fetched; a frame is deleted (only if configured) after its hash and `verified` are durable.
 //  - Each expected camera ends with its debt paid or missed, with a note naming slot and remedy. Events alone are not believed:
 //    what was not announced is looked for on the card.
-//  - A camera in trouble climbs a ladder - again, open anew, reset, port power, relay - and is quarantined 15 s after its trouble
-//    showed. The others do not wait for it, except at the end of the take.
+//  - A camera in trouble climbs a ladder - again, open anew, reset, port power, relay - and is quarantined 15 s after it fell
+//    silent. The others do not wait for it, except at the end of the take.
 #pragma once
 #include "rigd/calibrate.h"
 #include "rigd/camera.h"

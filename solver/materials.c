@@ -685,7 +685,7 @@ static void doubt_texels(void *arg, int64_t begin, int64_t end, int worker, doub
             x[p] = 1;
             packed_solve(n, A, x);
             const double of_lights = p < DISNEY_N ? 0 : of_light * (double)m->albedo[t][p - DISNEY_N];
-            m->std[t][p] = is_free[p] ? (float)sqrt(error2 * x[p] + (p < DISNEY_N ? 0 : of_region[p - DISNEY_N]) + of_lights * of_lights) : r->std[p];
+            m->std[t][p] = is_free[p] ? (float)sqrt(error2 * x[p] + (p < DISNEY_N ? 0 : fmax(of_region[p - DISNEY_N], 0)) + of_lights * of_lights) : r->std[p];
         }
     }
 }

@@ -568,12 +568,10 @@ static void add_squares(double B[THETA_PACKED], const double g[DISNEY_N], double
 }
 
 // Covariance of a region's theta, albedos eliminated: A^-1 B A^-1 with B the squared scores of samples, and what they are more than that
-// when summed over the groups of each way (Cameron, Gelbach, Miller 2011). leeway, or NULL: what share of the squared error theta takes up by
-// fitting such things, tr(A^-1 B) of the sum of squares (Takeuchi 1976).
-static int region_uncertainty(struct search *s, const struct texel_scene *scene, const struct witnesses *w, uint16_t frozen, struct region *r,
-                              double *leeway)
+// when summed over the groups of each way (Cameron, Gelbach, Miller 2011).
+static int region_uncertainty(struct search *s, const struct texel_scene *scene, const struct witnesses *w, uint16_t frozen, struct region *r)
 {
-    double squares = 0, A[THETA_PACKED] = { 0 }, B[THETA_PACKED] = { 0 }, B_samples[THETA_PACKED] = { 0 }, C[DISNEY_N][DISNEY_N] = { { 0 } };
+    double A[THETA_PACKED] = { 0 }, B[THETA_PACKED] = { 0 }, B_samples[THETA_PACKED] = { 0 }, C[DISNEY_N][DISNEY_N] = { { 0 } };
     const int n_views = s->scene->samples->n_views, n_groups = n_views > PATCHES ? n_views : PATCHES;
     double(*score)[DISNEY_N] = calloc((size_t)n_groups * N_WAYS, sizeof(*score));
     double(*J)[DISNEY_N] = malloc(3 * TEXEL_VIEWS_MAX * sizeof(*J));
@@ -599,7 +597,6 @@ static int region_uncertainty(struct search *s, const struct texel_scene *scene,
         for (int i = 0; i < n; i++) {
             int group[N_WAYS];
             groups_of(scene, w->texel[k], rows[i].view, (int)((int64_t)k * PATCHES / w->n), group);
-            squares += (double)rows[i].residual * (double)rows[i].residual;
             for (int p = 0; p < DISNEY_N; p++) {
                 J[i][p] = (double)rows[i].J[p];
                 for (int a = 0; a < 3; a++)
@@ -638,12 +635,7 @@ static int region_uncertainty(struct search *s, const struct texel_scene *scene,
         inverse[p][p] = 1;
         packed_solve(DISNEY_N, A, inverse[p]);
     }
-    double taken = 0, least[DISNEY_N] = { 0 };
-    for (int p = 0; p < DISNEY_N; p++)
-        for (int q = 0; q < DISNEY_N; q++)
-            taken += inverse[p][q] * B[packed_at(p, q)];
-    if (leeway)
-        *leeway = regular && squares > 0 ? taken / squares : INFINITY;
+    double least[DISNEY_N] = { 0 };
     for (int p = 0; p < DISNEY_N; p++)
         for (int q = 0; q < DISNEY_N; q++)
             for (int a = 0; a < DISNEY_N; a++)
@@ -701,25 +693,23 @@ static void call_both(const struct witnesses *a, const struct witnesses *b, stru
     }
 }
 
-// Two regions are one as long as both do as well under one reflectance: no worse than by a tenth of the squared error, by half of it while no
-// parameter is known to differ, or by what a reflectance of their own takes up of anything. Where the lights are wrong every piece of the surface does better by itself, in views set
-// aside too, which share the lights' error; what is left of the pictures under a theta of its own says how much of that there is.
+// Two regions are one as long as both do as well under one reflectance: no worse than by a tenth of the squared error, or by half of it while
+// no parameter is known to differ. Where the lights are wrong every piece of the surface does better by itself, in views set aside too, which
+// share the lights' error.
 static int merge(struct search *s)
 {
     int err = 0;
     while (!err && s->out->n > 1) {
-        double least = INFINITY, error2, most_worse[REGIONS_MAX];
+        double least = INFINITY, error2;
         float alone[REGIONS_MAX][WITNESSES];
         struct witnesses w[REGIONS_MAX];
         float best_theta[DISNEY_N];
         int best_a = -1, best_b = -1;
         for (int r = 0; !err && r < s->out->n; r++) {
-            double leeway;
             call_witnesses(s, 1u << r, &w[r]);
             err = test(s, &w[r], s->out->region[r].theta, 0, -1, &error2, NULL, alone[r]);
             if (!err)
-                err = region_uncertainty(s, &s->inner, &w[r], 0, &s->out->region[r], &leeway);
-            most_worse[r] = 1 + (double)(unknown_misfit * unknown_misfit) * leeway;
+                err = region_uncertainty(s, &s->inner, &w[r], 0, &s->out->region[r]);
         }
         for (int a = 0; !err && a < s->out->n; a++)
             for (int b = a + 1; !err && b < s->out->n; b++) {
@@ -736,10 +726,9 @@ static int merge(struct search *s)
                 if (err)
                     break;
                 const double worse_a = how_much_worse(one, alone[a], w[a].n), worse_b = how_much_worse(other, alone[b], w[b].n);
-                const double least_allowed = known_to_differ(&s->out->region[a], &s->out->region[b]) ? worth_a_region : worth_a_doubtful_one;
-                const double worse = fmax(worse_a / fmax(most_worse[a], least_allowed), worse_b / fmax(most_worse[b], least_allowed));
-                log_debug("regions: %d and %d of %d as one: views aside %.4f x, %.4f x; allowed %.4f, %.4f", a, b, s->out->n, worse_a, worse_b,
-                          fmax(most_worse[a], least_allowed), fmax(most_worse[b], least_allowed));
+                const double allowed = known_to_differ(&s->out->region[a], &s->out->region[b]) ? worth_a_region : worth_a_doubtful_one;
+                const double worse = fmax(worse_a, worse_b) / allowed;
+                log_debug("regions: %d and %d of %d as one: views aside %.4f x, %.4f x; allowed %.1f", a, b, s->out->n, worse_a, worse_b, allowed);
                 if (worse < least) {
                     least = worse, best_a = a, best_b = b;
                     memcpy(best_theta, theta, sizeof(theta));
@@ -776,7 +765,7 @@ static int simplify(struct search *s, const struct witnesses *w, struct region *
         struct region simpler = *r;
         const int p = __builtin_ctz(without[k]); // the layer's amount; the other says how it looks
         double error;
-        err = region_uncertainty(s, s->scene, w, *frozen, r, NULL);
+        err = region_uncertainty(s, s->scene, w, *frozen, r);
         if (!k)
             *full = *r;
         if (!err)
@@ -831,7 +820,7 @@ static int choose_freedom(struct search *s, struct region *r, int at)
     if (!err && w.n)
         err = fit_from(&last, r->theta, 100, 1e-8, r->theta, &cost);
     if (!err)
-        err = region_uncertainty(s, s->scene, &w, frozen, r, NULL);
+        err = region_uncertainty(s, s->scene, &w, frozen, r);
     // What was frozen might have been otherwise: the doubt is that of the full model, and how far freezing moved the others.
     for (int p = 0; !err && p < DISNEY_N; p++)
         if (isfinite(r->std[p]))

@@ -96,6 +96,19 @@ static void what_was_written_verifies_and_what_changed_is_named(void **state)
     tear_down();
 }
 
+static void a_take_without_files_has_nothing_to_hand_over(void **state)
+{
+    (void)state;
+    char path[200];
+    set_up();
+    snprintf(path, sizeof(path), "rm %s/raw/*nef", dir);
+    assert_int_equal(system(path), 0);
+    assert_int_equal(manifest_write(dir, NULL, 0, 1795338000), 0);
+    snprintf(path, sizeof(path), "%s/ascmhl", dir);
+    assert_int_not_equal(access(path, F_OK), 0); // a list without a file is not in the schema
+    tear_down();
+}
+
 static void generations_follow_each_other(void **state)
 {
     (void)state;
@@ -161,6 +174,7 @@ int main(void)
 {
     const struct CMUnitTest tests[] = {
         cmocka_unit_test(what_was_written_verifies_and_what_changed_is_named),
+        cmocka_unit_test(a_take_without_files_has_nothing_to_hand_over),
         cmocka_unit_test(generations_follow_each_other),
         cmocka_unit_test(known_hashes_are_used_only_where_the_size_agrees),
         cmocka_unit_test(hostile_manifests_are_errors),

@@ -775,6 +775,21 @@ static void a_lost_event_is_found_on_the_card(void **state)
     tear_down();
 }
 
+static void a_camera_that_came_back_is_not_waited_for_but_its_card_is_read(void **state)
+{
+    (void)state;
+    set_up(6, 2);
+    open_all();
+    w.camera[1].fault.crash[CAMERA_COLLECT] = 2; // its events went with the worker
+    w.camera[4].fault.hang[CAMERA_COLLECT] = 2;
+    const struct ledger *l = capture();
+    check_accounts(l);
+    assert_int_equal(l->state, TAKE_VERIFIED);
+    assert_int_equal(w.camera[1].fault.crash[CAMERA_COLLECT], 1);
+    assert_int_equal(w.camera[4].fault.hang[CAMERA_COLLECT], 1);
+    tear_down();
+}
+
 static void a_shutter_that_stays_closed_is_named_with_slot_and_remedy(void **state)
 {
     (void)state;
@@ -1276,6 +1291,7 @@ int main(void)
         cmocka_unit_test(two_hundred_cameras_deliver_every_frame),
         cmocka_unit_test(the_same_inputs_give_the_same_actions),
         cmocka_unit_test(a_lost_event_is_found_on_the_card),
+        cmocka_unit_test(a_camera_that_came_back_is_not_waited_for_but_its_card_is_read),
         cmocka_unit_test(a_shutter_that_stays_closed_is_named_with_slot_and_remedy),
         cmocka_unit_test(one_fault_at_any_command_costs_no_frame),
         cmocka_unit_test(nothing_is_sent_from_the_last_answer_before_half_press_to_the_end_of_exposure),

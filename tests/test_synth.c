@@ -597,17 +597,21 @@ static void own_objects_are_scaled_centred_and_painted(void **state)
         for (int i = 0; i < texels.n; i++) {
             const size_t at = texels.pixel[i];
             const int row = (int)at / s.texture_size;
-            const bool top = row < s.texture_size / 4;
-            if (!top && row < s.texture_size - s.texture_size / 4)
-                continue; // between the two pixels' centres they mix
+            const int sure = s.texture_size / 4 - 2; // between the two pixels' centres they mix, and a texel on the rim may be its neighbour's copy
+            const bool top = row < sure;
+            if (!top && row < s.texture_size - sure)
+                continue;
             n[top]++;
-            const float *c = albedo.data + 3 * at, *theta = brdf.data + DISNEY_N * at;
+            const float *c = albedo.data + 3 * at;
             assert_true(fabs((double)c[0] - (top ? 1 : .0030353)) < 1e-5 && fabs((double)c[1] - (top ? .5028865 : 0)) < 1e-5);
-            assert_true(fabs((double)theta[DISNEY_ROUGHNESS] - (top ? .2 : .8)) < 1e-5);
-            assert_true(fabs((double)theta[DISNEY_METALLIC] - (top ? 1 : 0)) < 1e-5);
-            assert_true(theta[DISNEY_SHEEN] == .25f && theta[DISNEY_SPECULAR] == .5f);
+            for (int k = 0; k < DISNEY_N; k++) { // the file has its channels in another order
+                const double expected = k == DISNEY_ROUGHNESS  ? (top ? .2 : .8)
+                                        : k == DISNEY_METALLIC ? (top ? 1 : 0)
+                                                               : (double)s.own_theta[k];
+                assert_true(fabs((double)brdf.data[DISNEY_N * at + (size_t)image_channel(&brdf, disney_parameter_names[k])] - expected) < 1e-5);
+            }
         }
-        assert_true(n[0] > 20 && n[1] > 20);
+        assert_true(n[flipped] > 20 && n[!flipped] == 0); // the pebble's atlas leaves the top of its square empty
         image_free(&albedo), image_free(&brdf), texels_free(&texels), mesh_free(&mesh);
     }
     s.mesh_path = NULL;

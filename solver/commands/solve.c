@@ -42,7 +42,7 @@ enum {
 
 static const struct argp_option options[] = {
     { 0, 0, 0, 0, "Method", 2 },
-    { "preset", OPTION_PRESET, "NAME", 0, "preview (texture 128), standard (256, default) or final (512); with --stage 2: 128, 512, 2048", 2 },
+    { "preset", OPTION_PRESET, "NAME", 0, "preview (stage 1, texture 128), standard (512, default) or final (2048); with --stage 1: 128, 256, 512", 2 },
     { "method", OPTION_METHOD, "NAME", 0, "joint (default), alternating (the paper) or directional", 2 },
     { "texture", OPTION_TEXTURE, "N", 0, "N x N texels", 2 },
     { "lights", OPTION_LIGHTS, "N", 0, "lights with a distance of their own, a power of two (256)", 2 },
@@ -443,6 +443,8 @@ int command_solve(int argc, char **argv)
     s.joint.continuation = !s.no_continuation;
     s.joint.n_threads = s.n_threads;
     s.materials.no_visibility = s.no_visibility;
+    if (!s.materials.last_stage)
+        s.materials.last_stage = s.materials.lights_from || strcmp(s.preset, "preview") ? 2 : 1;
     if (!s.n_sub)
         s.n_sub = s.joint.method == METHOD_JOINT ? 4 : 1;
     if (!s.texture)

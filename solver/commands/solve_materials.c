@@ -21,7 +21,7 @@ enum { KEY_STAGE = 0x20000, KEY_LIGHTS_FROM, KEY_W_REG, KEY_W_PARENT, KEY_NO_SEA
 
 static const struct argp_option options[] = {
     { 0, 0, 0, 0, "Materials", 4 },
-    { "stage", KEY_STAGE, "1|2", 0, "the last stage: 1 (default) finds the lights and one shared reflectance, 2 the textures too", 4 },
+    { "stage", KEY_STAGE, "1|2", 0, "the last stage: 1 finds the lights and one shared reflectance, 2 (default; with --preset preview: 1) the textures too", 4 },
     { "lights-from", KEY_LIGHTS_FROM, "PATH", 0, "no stage 1: lights of an earlier solve's folder, or of a lights.json", 4 },
     { "w-reg", KEY_W_REG, "W", 0, "weight of the textures' smoothness beside the sum of squares (joint: .02; alternating: 1)", 4 },
     { "w-parent", KEY_W_PARENT, "W", 0, "weight that draws a texel towards its coarser parent (joint: .02; alternating: 0)", 4 },
@@ -76,8 +76,6 @@ static error_t parse(int key, char *text, struct argp_state *state)
     case ARGP_KEY_END:
         if (s->lights_from && s->last_stage == 1)
             argp_error(state, "--lights-from leaves stage 1 out, --stage 1 all the rest");
-        if (!s->last_stage)
-            s->last_stage = s->lights_from ? 2 : 1;
         return 0;
     default:
         return ARGP_ERR_UNKNOWN;

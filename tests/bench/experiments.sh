@@ -54,7 +54,7 @@ solve() { # set, take, folder, method
     mkdir -p "$3"
     code=0
     # shellcheck disable=SC2086
-    "$rigsolve" solve "$2" -o "$3" --method "$4" $material $solve_options >"$3/log" 2>&1 || code=$?
+    "$rigsolve" solve "$2" -o "$3" --stage 1 --method "$4" $material $solve_options >"$3/log" 2>&1 || code=$?
     case $code in
     0|3) ;;
     *) say "solve failed ($code): $(grep -av '^Try ' "$3/log" | tail -n 1)"; return 0 ;;
