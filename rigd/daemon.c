@@ -229,6 +229,8 @@ static void done_commit(struct daemon *d, struct job *j)
 
 static void work_manifest(struct job *j)
 {
+    int n_removed = 0;
+    ledger_remove_parts(j->dir, &n_removed); // of workers that died: all copying is over
     j->err = manifest_write(j->dir, j->known, j->n_known, j->value);
 }
 

@@ -591,15 +591,22 @@ static int reconcile_object(struct ledger_object *o, const char *take_dir, struc
     return 0;
 }
 
+int ledger_remove_parts(const char *take_dir, int *n_removed)
+{
+    char path[1100];
+    int err = remove_parts(take_dir, n_removed);
+    for (int i = 0; i < N_FOLDERS && !err; i++) {
+        join(path, sizeof(path), take_dir, folders[i]);
+        err = remove_parts(path, n_removed);
+    }
+    return err;
+}
+
 int ledger_reconcile(struct ledger *l, const char *take_dir, struct ledger_findings *found)
 {
     char path[1100];
     *found = (struct ledger_findings){ 0 };
-    int err = remove_parts(take_dir, &found->n_parts_removed);
-    for (int i = 0; i < N_FOLDERS && !err; i++) {
-        join(path, sizeof(path), take_dir, folders[i]);
-        err = remove_parts(path, &found->n_parts_removed);
-    }
+    int err = ledger_remove_parts(take_dir, &found->n_parts_removed);
     for (int i = 0; i < l->n_cameras && !err; i++) {
         struct ledger_camera *c = &l->camera[i];
         bool taken_back = false;

@@ -89,6 +89,9 @@ void ledger_remove_leftovers(const char *takes_dir); // of creations that a cras
 struct ledger_findings { int n_adopted, n_taken_back, n_parts_removed, n_strangers; };
 int ledger_reconcile(struct ledger *l, const char *take_dir, struct ledger_findings *found); // 0 or -errno (logged)
 
+// Remove *.part in the take and its folders, when nothing is copied any more: what a worker that was killed had begun. 0 or -errno.
+int ledger_remove_parts(const char *take_dir, int *n_removed);
+
 // Which frames belong to this take and not to later ones: look at the ledgers in takes_dir that come after it. 0 or -errno (logged).
 int ledger_bound(struct ledger *l, const char *takes_dir);
 
