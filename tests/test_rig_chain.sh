@@ -39,7 +39,7 @@ iso = 100
 shutter = 1/125
 E
 simulate="$BIN/rigsim --cameras $CAMERAS --personality nikon --port $port --seed $SEED --raw-size 408x272 --trigger-socket $D/t"
-$simulate --list | sed 's/^half_line/personality = nikon\nhalf_line/' >>"$D/rigd.conf"
+$simulate --list >>"$D/rigd.conf"
 $simulate >"$D/sim.log" 2>&1 &
 sim=$!
 start() {
