@@ -23,7 +23,7 @@ enum {
     GRACE_MS = 1000,          // an answer may be so much later than the command's timeout
     GREETING_MS = 8000,       // from spawn to HELLO
     BUSY_MS = 5000,           // back-off in all
-    TROUBLE_MS = 15000,       // ladder in all, counted from
+    TROUBLE_MS = 14500,       // ladder in all, counted from
     SILENCE_MS = 4000,        // when the command was sent that failed, but at most so long before it did: drivers wait 3 s for an answer
     POWER_OFF_MS = 1500, POWER_ON_MS = 2000, RELAY_OFF_MS = 2000, RELAY_ON_MS = 2500,
     REOPEN_MS = 1000,         // between tries when the ladder has no rung left
