@@ -19,7 +19,7 @@ struct config_camera {       // [camera "A01"]
     int feedback_line;       // flash-sync input; CONFIG_NONE
     int relay_line;          // output that cuts its supply when set; CONFIG_NONE
     char power[48];          // "1-4:3": hub and port that can switch its USB power; ""
-    int controller;          // bodies with the same number share one USB controller (from the slot's bus; PTP/IP: 0)
+    int controller;          // bodies with the same number share one USB controller (the slot's bus + 1; PTP/IP: 0)
     int n_settings;          // [settings] with this camera's own "setting.NAME = VALUE" on top
     struct camera_setting setting[CAMERA_SETTINGS_MAX];
 };

@@ -82,7 +82,7 @@ static int set_up_machine(int n, int n_buses)
         snprintf(c->name, sizeof(c->name), "A%02d", i + 1);
         snprintf(c->port, sizeof(c->port), "usb:%d-%d", bus, port);
         snprintf(c->serial, sizeof(c->serial), "%d", 6001000 + i);
-        c->controller = bus;
+        c->controller = bus + 1; // as config.c numbers them
         snprintf(serial, sizeof(serial), "0000%d\n", 6001000 + i); // as USB says it
         plug(bus, port, serial);
     }
