@@ -12,7 +12,7 @@ MACHINE := $(shell uname -m)
 
 # ---- packages (Debian 12; the same names in Debian 13) ----------------------------------------------------------------
 PACKAGES := gcc make pkg-config libopenexr-dev libembree-dev libassimp-dev libjansson-dev libtiff-dev libpng-dev libjpeg-dev libexpat1-dev liblapacke-dev libopenblas-dev libcmocka-dev perl help2man \
-  libgphoto2-dev libgpiod-dev libinih-dev libsystemd-dev libumockdev-dev libxxhash-dev
+  libgphoto2-dev libgpiod-dev libinih-dev libraw-dev libsystemd-dev libumockdev-dev libxxhash-dev
 PACKAGES_FUZZ := clang libclang-rt-dev
 PACKAGES_BENCH := libceres-dev g++ gnuplot-nox
 
@@ -35,8 +35,8 @@ endif
 TAKE := $(wildcard solver/take/*.c)
 LIBRARY := $(TAKE) $(filter-out solver/main.c,$(wildcard solver/*.c)) $(wildcard solver/kernels/*.c)
 COMMANDS := $(wildcard solver/commands/*.c)
-RIG_PROGRAMS := rigctl rigd rigd-camera
-RIG := $(filter-out $(addprefix rigd/,camera_gphoto.c camera_worker.c daemon.c main.c rigctl.c),$(wildcard rigd/*.c))
+RIG_PROGRAMS := rigctl rigd rigd-camera rigd-unpack
+RIG := $(filter-out $(addprefix rigd/,camera_gphoto.c camera_worker.c daemon.c develop.c main.c rigctl.c unpack.c),$(wildcard rigd/*.c))
 RIGSIM := $(wildcard tests/rigsim/*.c)
 RIGSIM_LIB := $(filter-out $(addprefix tests/rigsim/,client.c main.c server.c server_faults.c server_shutter.c),$(RIGSIM))
 LIBS_RIG = -ljansson -linih -lsystemd -lxxhash -lgpiod -lm
@@ -90,6 +90,8 @@ $(BUILD)/bin/rigctl: $(call object,rigd/rigctl.c) $(BUILD)/librig.a $(BUILD)/lib
 	$(link_rig) $(LIBS_RIG) -o $@
 $(BUILD)/bin/rigd-camera: $(call object,rigd/camera_gphoto.c rigd/camera_worker.c) $(BUILD)/librig.a $(BUILD)/libtake.a
 	$(link_rig) $(LIBS_CAMERA) -o $@
+$(BUILD)/bin/rigd-unpack: $(call object,rigd/develop.c rigd/unpack.c)
+	$(link_rig) -lraw_r -o $@
 $(BUILD)/bin/rigsim: $(call object,$(filter-out %/client.c,$(RIGSIM))) $(BUILD)/libstudiorig.a
 	@mkdir -p $(@D)
 	@$(if $(V),,echo '  LD $@')

@@ -2,7 +2,7 @@
 //
 // A light look at the container, by the name's extension: TIFF and the raws built on it (directories and the data they point
 // at lie within the file), CR3 (boxes tile the file), RAF, JPEG (begins and ends as one). It finds short files and strangers
-// that a camera announced with the size it sent; pixels are unpacked elsewhere. Input is hostile.
+// that a camera announced with the size it sent; pixels are unpacked by rigd-unpack. Input is hostile.
 #pragma once
 #include <stddef.h>
 #include <stdint.h>

@@ -544,6 +544,41 @@ static void a_broken_link_leaves_nothing_and_heals_by_opening(void **state)
     }
 }
 
+// The worker asks the rigd-unpack beside it: here one that finds every frame damaged, and one that is not there.
+static void frames_that_do_not_unpack_get_no_name(void **state)
+{
+    (void)state;
+    static const char script[] = "#!/bin/sh\n[ -s \"$1\" ] && echo the seventh row is missing\nexit 1\n";
+    char command[1600], *folder = getenv("BIN") ? strdup(getenv("BIN")) : NULL;
+    struct sim s;
+    struct worker w;
+    sim_start(&s, "generic", "");
+    snprintf(command, sizeof(command), "mkdir %s && cp %s/rigd-camera %s", scratch_path("bin"), folder ? folder : "build/bin", scratch_path("bin"));
+    assert_int_equal(system(command), 0);
+    scratch_write("bin/rigd-unpack", script, sizeof(script) - 1);
+    assert_int_equal(chmod(scratch_path("bin/rigd-unpack"), 0755), 0);
+    setenv("BIN", scratch_path("bin"), 1);
+    worker_start(&w);
+    const struct camera_object o = shoot(&w, &s, "generic");
+    fails(&w, fetching(CAMERA_FETCH, &o, "A01.dng"), CAMERA_CORRUPT);
+    assert_non_null(strstr(w.answer.text, "the seventh row is missing"));
+    assert_false(is_there("A01.dng"));
+    assert_false(is_there("A01.dng.part"));
+    unlink(scratch_path("bin/rigd-unpack"));
+    done(&w, fetching(CAMERA_FETCH, &o, "A01.dng"));
+    assert_true(is_there("A01.dng"));
+    worker_stop(&w);
+    sim_stop(&s);
+    unlink(scratch_path("bin/rigd-camera"));
+    rmdir(scratch_path("bin"));
+    unlink(scratch_path("A01.dng"));
+    if (folder)
+        setenv("BIN", folder, 1);
+    else
+        unsetenv("BIN");
+    free(folder);
+}
+
 static void short_frames_get_no_name(void **state)
 {
     (void)state;
@@ -701,6 +736,7 @@ int main(void)
         cmocka_unit_test(a_busy_body_is_busy_and_not_bare_of_settings),
         cmocka_unit_test(a_full_card_is_the_card),
         cmocka_unit_test(a_broken_link_leaves_nothing_and_heals_by_opening),
+        cmocka_unit_test(frames_that_do_not_unpack_get_no_name),
         cmocka_unit_test(short_frames_get_no_name),
         cmocka_unit_test(nothing_is_written_over_a_strangers_file),
         cmocka_unit_test(killed_in_the_middle_a_frame_is_whole_or_not_there),

@@ -42,6 +42,7 @@ simulate="$BIN/rigsim --cameras $CAMERAS --personality nikon --port $port --seed
 $simulate --list >>"$D/rigd.conf"
 $simulate >"$D/sim.log" 2>&1 &
 sim=$!
+while [ ! -S "$D/t" ]; do kill -0 $sim || { echo "1..0 # rigsim did not start: $(tail -1 "$D/sim.log")"; exit 1; }; sleep .1; done
 start() {
     "$BIN/rigd" --config "$D/rigd.conf" >>"$D/rigd.log" 2>&1 &
     rigd=$!
