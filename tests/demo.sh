@@ -57,8 +57,8 @@ step "2/5 the panorama becomes 256 lights by median cut"
 step "3/5 who sees which texel: 85 cameras and 256 lights, traced"
 "$rigsolve" visibility "$out/take" -o "$out" --texture 256 --lights 256 --overlay "$out/outlines" |
     tail -n 2
-step "4/5 solving: where the lights are, the material and every texel's albedo, from the pictures and the panorama alone"
-"$rigsolve" solve "$out/take" -o "$out/solve"
+step "4/5 solving: where the lights are, then textures of albedo and ten parameters, from the pictures and the panorama alone"
+"$rigsolve" solve "$out/take" -o "$out/solve" --texture 256
 step "5/5 what was solved, seen by the same cameras, beside the pictures (every 7th view was not used for solving)"
 "$rigsolve" render "$out/solve" --cameras "$out/take/geometry/cameras" -o "$out/views" --no-shadows
 "$rigsolve" compare "$out/views" "$out/take/linear" >"$out/compare.txt"
