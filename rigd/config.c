@@ -382,7 +382,7 @@ static const char *set_value(const struct key *key, void *target, const char *va
             memcpy(field, &none, sizeof(none));
             return NULL;
         }
-        if (!to_number(value, &n) || n != (int)n || n < 0 || n >= LINES_MAX)
+        if (!to_number(value, &n) || n < 0 || n >= LINES_MAX || n != (int)n)
             return "a line's number, or none";
         const int line = (int)n;
         memcpy(field, &line, sizeof(line));
