@@ -134,8 +134,11 @@ int relocate_doubt(struct joint_result *result, const struct texels *texels, con
         err = begin(&s, &result->state, group, texels, samples, rays, fit, theta, indirect, settings);
     if (!err)
         err = photometric_evaluate(&s.p, &s.base, true, &e);
+    double theta_std[DISNEY_N]; // theta is held here: stage 1's own deviations stay
+    memcpy(theta_std, result->theta_std, sizeof(theta_std));
     if (!err)
         err = stage1_uncertainty(&s, result);
+    memcpy(result->theta_std, theta_std, sizeof(theta_std));
     if (!err) {
         result->doubts &= ~(unsigned)(DOUBT_UNCERTAIN | DOUBT_POOR_FIT);
         stage1_doubt(&s, result, n_fit);
