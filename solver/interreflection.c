@@ -6,6 +6,7 @@
 
 #include "solver/parallel.h"
 #include "solver/random.h"
+#include "solver/surface.h"
 
 #include <errno.h>
 #include <stdlib.h>
@@ -27,17 +28,6 @@ struct job {
     float (*indirect)[3];         // [n_texels] in: of the bounces so far
 };
 
-static void surface_of(struct surface_point *out, const struct texels *t, int texel)
-{
-    memcpy(out->position_m, t->position_m[texel], sizeof(out->position_m));
-    memcpy(out->normal, t->normal[texel], sizeof(out->normal));
-    memcpy(out->tangent, t->tangent[texel], sizeof(out->tangent));
-    const float *n = out->normal, *x = out->tangent;
-    out->bitangent[0] = n[1] * x[2] - n[2] * x[1];
-    out->bitangent[1] = n[2] * x[0] - n[0] * x[2];
-    out->bitangent[2] = n[0] * x[1] - n[1] * x[0];
-}
-
 // ---- what is sent -------------------------------------------------------------------------------
 
 struct sender {
@@ -53,7 +43,7 @@ static void send(void *arg, int64_t begin, int64_t end, int worker)
     for (int t = (int)begin; t < (int)end; t++) {
         struct surface_point p;
         float E[3] = { 0 };
-        surface_of(&p, s->texels, t);
+        surface_of_texel(&p, s->texels, t);
         if (s->soft) {
             struct lit *lit = &a->lit[worker];
             s->kernels->gather(lit, s->lights, &p, NULL, s->soft + (size_t)t * (size_t)s->lights->n);
@@ -131,7 +121,7 @@ static void gather_at(const struct job *j, const struct texels *t, int i, float 
     struct surface_point p;
     float start[3];
     double sum[3] = { 0 };
-    surface_of(&p, t, i);
+    surface_of_texel(&p, t, i);
     rays_start(j->s->rays, t->triangle[i], t->barycentric[i], start);
     const double shift = random_uniform(11, (uint64_t)i, 0), turn = random_uniform(11, (uint64_t)i, 1);
     for (int k = 0; k < j->s->n_rays; k++) { // a spiral (Fibonacci), turned from texel to texel

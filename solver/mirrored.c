@@ -1,8 +1,10 @@
 // solver/mirrored.c - a few rays per sample along its mirrored lobe, each bringing back what leaves the place it meets.
 #include "solver/mirrored.h"
 
+#include "solver/interreflection.h"
 #include "solver/parallel.h"
 #include "solver/random.h"
+#include "solver/surface.h"
 #include "solver/take/half.h"
 #include "solver/vec3.h"
 
@@ -17,17 +19,6 @@ struct job {
     struct lit *lit; // [threads]
     float (*radiance)[3];
 };
-
-static void surface_of(struct surface_point *out, const struct texels *t, int texel)
-{
-    memcpy(out->position_m, t->position_m[texel], sizeof(out->position_m));
-    memcpy(out->normal, t->normal[texel], sizeof(out->normal));
-    memcpy(out->tangent, t->tangent[texel], sizeof(out->tangent));
-    const float *n = out->normal, *x = out->tangent;
-    out->bitangent[0] = n[1] * x[2] - n[2] * x[1];
-    out->bitangent[1] = n[2] * x[0] - n[0] * x[2];
-    out->bitangent[2] = n[0] * x[1] - n[1] * x[0];
-}
 
 // The texel at a place of the surface, or one beside it; -1: the atlas has none there.
 static int32_t texel_at(const struct mirrored *m, const struct ray_hit *hit)
@@ -54,7 +45,7 @@ static bool leaving(const struct job *j, struct lit *lit, int texel, const float
     const struct mirrored *m = j->m;
     struct surface_point s;
     struct shade_material material = { .variant = m->variant };
-    surface_of(&s, m->texels, texel);
+    surface_of_texel(&s, m->texels, texel);
     if (s.normal[0] * to[0] + s.normal[1] * to[1] + s.normal[2] * to[2] <= 0)
         return false;
     memcpy(material.theta, m->theta[texel], sizeof(material.theta));
@@ -62,9 +53,8 @@ static bool leaving(const struct job *j, struct lit *lit, int texel, const float
     j->kernels->gather(lit, &j->lights, &s, m->visible ? m->visible + (size_t)texel * (size_t)m->words_per_texel : NULL,
                        m->soft ? m->soft + (size_t)texel * (size_t)m->lights->n : NULL);
     j->kernels->shade(L, lit, &s, to, &material);
-    const float matt = (1 - material.theta[DISNEY_METALLIC]) / (float)M_PI;
     for (int c = 0; m->indirect && c < 3; c++)
-        L[c] += matt * material.albedo[c] * m->indirect[texel][c];
+        L[c] += indirect_constant(m->indirect[texel][c], material.theta) + indirect_own(m->indirect[texel][c]) * material.albedo[c];
     return true;
 }
 
@@ -87,7 +77,7 @@ static void gather_texels(void *arg, int64_t begin, int64_t end, int worker)
         struct surface_point s;
         float start[3];
         double F0[3];
-        surface_of(&s, m->texels, t);
+        surface_of_texel(&s, m->texels, t);
         rays_start(m->rays, m->texels->triangle[t], m->texels->barycentric[t], start);
         specular_colour(m->theta[t], m->albedo[t], F0);
         const double r = (double)m->theta[t][DISNEY_ROUGHNESS], a2 = fmax(r * r, .001) * fmax(r * r, .001);

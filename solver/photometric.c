@@ -4,6 +4,7 @@
 #include "solver/interreflection.h"
 #include "solver/normal_equations.h"
 #include "solver/parallel.h"
+#include "solver/surface.h"
 #include "solver/vec3.h"
 
 #include <assert.h>
@@ -242,17 +243,6 @@ fail:
     return -ENOMEM;
 }
 
-static void surface_of(struct surface_point *out, const struct texels *t, int texel)
-{
-    memcpy(out->position_m, t->position_m[texel], sizeof(out->position_m));
-    memcpy(out->normal, t->normal[texel], sizeof(out->normal));
-    memcpy(out->tangent, t->tangent[texel], sizeof(out->tangent));
-    const float *n = out->normal, *x = out->tangent;
-    out->bitangent[0] = n[1] * x[2] - n[2] * x[1];
-    out->bitangent[1] = n[2] * x[0] - n[0] * x[2];
-    out->bitangent[2] = n[0] * x[1] - n[1] * x[0];
-}
-
 static const uint16_t *visible_of(const struct photometric *p, int texel)
 {
     return p->visible ? p->visible + (size_t)texel * (size_t)p->words_per_texel : NULL;
@@ -378,7 +368,7 @@ static void evaluate_texels(void *arg, int64_t begin, int64_t end, int worker, d
         const int n_seen = observe(j, texel, w->seen);
         if (!n_seen)
             continue;
-        surface_of(&point, j->p->texels, texel);
+        surface_of_texel(&point, j->p->texels, texel);
         if (j->p->model == REFLECT_DISNEY)
             j->kernels->gather(&w->lit, &j->lights, &point, visible_of(j->p, texel), NULL);
         material_of(j, texel, &m);
@@ -553,7 +543,7 @@ static void add_texels(void *arg, int64_t begin, int64_t end, int worker, double
         const int n_seen = observe(j, texel, w->seen);
         if (!n_seen)
             continue;
-        surface_of(&point, j->p->texels, texel);
+        surface_of_texel(&point, j->p->texels, texel);
         material_of(j, texel, &m);
         const bool lambert = j->p->model == REFLECT_LAMBERT;
         if (lambert) {

@@ -5,9 +5,10 @@
 #pragma once
 #include "solver/joint.h"
 
-// state: lights and albedo, in and out (lights of one group move together, their distances in the ratio they have); its log_gain stays. theta[n_texels]; indirect[n_texels]: irradiance from the
-// object itself (interreflection.h), or NULL. The similarity term starts 100 times as heavy as first_w_sim and falls by
-// decades as long as views set aside gain. error_before, error_after: RMSE of those views in percent. 0 or -ENOMEM.
+// state: lights and albedo, in and out (lights of one group move together, their distances in the ratio they have); its log_gain
+// stays. theta[n_texels]; indirect[n_texels]: irradiance from the object itself (interreflection.h), or NULL. The weight of the
+// similarity term falls by decades, 1e-3 to 1e-9 beside the mean of squares, until views aside gain nothing more; what they do not
+// like better is not kept. error_before, error_after: RMSE of those views in percent. 0 or -ENOMEM.
 int relocate_lights(struct photometric_state *state, const struct texels *texels, const struct samples *samples, const struct rays *rays,
                     const uint8_t *hold_out, const float (*theta)[DISNEY_N], const float (*indirect)[3],
                     const struct joint_settings *settings, double *error_before, double *error_after);

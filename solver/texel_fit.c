@@ -4,6 +4,7 @@
 #include "solver/interreflection.h"
 #include "solver/packed.h"
 #include "solver/random.h"
+#include "solver/surface.h"
 
 #include <errno.h>
 #include <stdlib.h>
@@ -82,17 +83,6 @@ static void gather_lights(const struct texel_scene *s, struct texel_worker *w, i
                        s->soft ? s->soft + t * (size_t)s->lights.n : NULL);
 }
 
-static void surface_of(struct surface_point *out, const struct texels *t, int texel)
-{
-    memcpy(out->position_m, t->position_m[texel], sizeof(out->position_m));
-    memcpy(out->normal, t->normal[texel], sizeof(out->normal));
-    memcpy(out->tangent, t->tangent[texel], sizeof(out->tangent));
-    const float *n = out->normal, *x = out->tangent;
-    out->bitangent[0] = n[1] * x[2] - n[2] * x[1];
-    out->bitangent[1] = n[2] * x[0] - n[0] * x[2];
-    out->bitangent[2] = n[0] * x[1] - n[1] * x[0];
-}
-
 // Fills seen and v. What a camera clipped is a lower bound no higher than white, however much a file without clipping says.
 static int observe(const struct texel_scene *s, struct texel_worker *w, int texel, int most_views)
 {
@@ -128,7 +118,7 @@ static void shade(const struct texel_scene *s, struct texel_worker *w, int texel
     struct shade_material m = { .variant = s->variant };
     memcpy(m.theta, theta, sizeof(m.theta));
     memcpy(m.albedo, albedo, sizeof(m.albedo));
-    surface_of(&point, s->texels, texel);
+    surface_of_texel(&point, s->texels, texel);
     gather_lights(s, w, texel, &point);
     s->kernels->shade_jacobian_views(w->jacobian, n, &w->lit, &point, (const float(*)[3])w->v, &m);
     for (int k = 0; k < n; k++) {
@@ -299,7 +289,7 @@ void texel_measure(const struct texel_scene *s, struct texel_worker *w, int texe
         return;
     memcpy(m.theta, theta, sizeof(m.theta));
     memcpy(m.albedo, albedo, sizeof(m.albedo));
-    surface_of(&point, s->texels, texel);
+    surface_of_texel(&point, s->texels, texel);
     gather_lights(s, w, texel, &point);
     for (int k = 0; k < n; k++) {
         struct observation *o = &w->seen[k];

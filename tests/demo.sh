@@ -39,7 +39,7 @@ if [ "$n_cameras" -gt 0 ]; then
         [ $tries -lt 150 ] || { echo "demo: the cameras did not come up: see $out/rigd.log and $out/rigsim.log" >&2; exit 1; }
         sleep .2
     done
-    step "rig: each body's shutter lag is measured, and compensated from now on"
+    step "rig: each body's shutter lag is measured in five shots (some ten seconds), and compensated from now on"
     "$bin/rigctl" calibrate lag --shots 5 | tail -n 3
     step "rig: the button. Preflight, half-press, full-press, collect; every frame hashed, synced and read back"
     "$bin/rigctl" capture --name demo

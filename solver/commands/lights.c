@@ -233,12 +233,6 @@ static void blend(const struct canvas *v, int x, int y, const double rgb[3], dou
         at[c] = (uint8_t)lround(at[c] + opacity * (rgb[c] - at[c]));
 }
 
-static uint8_t srgb_byte(double linear)
-{
-    const double v = linear < 0 ? 0 : linear > 1 ? 1 : linear;
-    return (uint8_t)lround(255 * (v <= .0031308 ? 12.92 * v : 1.055 * pow(v, 1 / 2.4) - .055));
-}
-
 // Reinhard's global curve: the log-average goes to middle grey, the brightest pixel to white, so
 // that walls and lamps are both seen. Colours that would pass white lose saturation.
 static void paint_panorama(const struct canvas *v, const struct panorama *p,
@@ -267,7 +261,7 @@ static void paint_panorama(const struct canvas *v, const struct panorama *p,
             const double grey = top > 1 ? (top - 1) / (top - fmin(shown, 1) + 1e-9) : 0;
             uint8_t byte[3];
             for (int c = 0; c < 3; c++)
-                byte[c] = srgb_byte(ratio * rgb[c] + grey * (shown - ratio * rgb[c]));
+                byte[c] = image_srgb_byte(ratio * rgb[c] + grey * (shown - ratio * rgb[c]));
             for (int j = 0; j < v->scale; j++)
                 for (int i = 0; i < v->scale; i++)
                     memcpy(v->rgb +

@@ -8,7 +8,7 @@
 # the kernel's headers. Whatever is missing skips the test.
 #   run.sh FOLDER TEST_PROGRAM
 set -u
-work=$1 program=$2 here=$(dirname "$0")
+folder=$1 program=$2 here=$(dirname "$0")
 skip() {
     echo "1..0 # SKIP $1"
     exit 0
@@ -33,56 +33,56 @@ if [ -n "$missing" ]; then
     DEBIAN_FRONTEND=noninteractive $SUDO apt-get install -y -qq --no-install-recommends $missing >/dev/null 2>&1 || skip "apt-get cannot install$missing"
 fi
 
-mkdir -p "$work/module"
-kernel=$work/vmlinux-$release
-modules=$work/image/lib/modules/$release/kernel
-if [ ! -s "$kernel" ] || [ ! -s "$work/module/$release.ko" ]; then
+mkdir -p "$folder/module"
+kernel=$folder/vmlinux-$release
+modules=$folder/image/lib/modules/$release/kernel
+if [ ! -s "$kernel" ] || [ ! -s "$folder/module/$release.ko" ]; then
     echo "# fetching and unpacking $image and the source of the module"
-    (cd "$work" && apt-get download -qq "$image" "linux-source-$series" >/dev/null 2>&1) || skip "apt-get cannot download $image and linux-source-$series"
-    rm -rf "$work/image" "$work/source"
-    mkdir -p "$work/source"
-    dpkg-deb -x "$work/$image"_*.deb "$work/image" || skip "$image cannot be unpacked"
+    (cd "$folder" && apt-get download -qq "$image" "linux-source-$series" >/dev/null 2>&1) || skip "apt-get cannot download $image and linux-source-$series"
+    rm -rf "$folder/image" "$folder/source"
+    mkdir -p "$folder/source"
+    dpkg-deb -x "$folder/$image"_*.deb "$folder/image" || skip "$image cannot be unpacked"
     s=linux-source-$series
-    dpkg-deb --fsys-tarfile "$work/$s"_*.deb | tar -xO "./usr/src/$s.tar.xz" | xz -dc | tar -x -C "$work/source" --strip-components=1 \
+    dpkg-deb --fsys-tarfile "$folder/$s"_*.deb | tar -xO "./usr/src/$s.tar.xz" | xz -dc | tar -x -C "$folder/source" --strip-components=1 \
         "$s/drivers/gpio/gpio-sim.c" "$s/drivers/gpio/gpiolib.h" "$s/kernel/irq/irq_sim.c" "$s/scripts/extract-vmlinux" || skip "$s is laid out differently"
-    cp "$here/Kbuild" "$work/source/drivers/gpio/gpiolib.h" "$work/module/"
-    sed 's/handle_simple_irq(irq_to_desc(irqnum))/generic_handle_irq(irqnum)/' "$work/source/kernel/irq/irq_sim.c" >"$work/module/irq_sim.c"
+    cp "$here/Kbuild" "$folder/source/drivers/gpio/gpiolib.h" "$folder/module/"
+    sed 's/handle_simple_irq(irq_to_desc(irqnum))/generic_handle_irq(irqnum)/' "$folder/source/kernel/irq/irq_sim.c" >"$folder/module/irq_sim.c"
     sed -e 's/gc->free = gpio_sim_free;/if (!keep) &/' -e '/^#include "gpiolib.h"/a static bool keep;\nmodule_param(keep, bool, 0644);' \
-        "$work/source/drivers/gpio/gpio-sim.c" >"$work/module/gpio-sim.c"
-    if ! make -s -C "/usr/src/$headers" M="$(realpath "$work/module")" modules >"$work/module.log" 2>&1; then
-        sed 's/^/# /' "$work/module.log"
+        "$folder/source/drivers/gpio/gpio-sim.c" >"$folder/module/gpio-sim.c"
+    if ! make -s -C "/usr/src/$headers" M="$(realpath "$folder/module")" modules >"$folder/module.log" 2>&1; then
+        sed 's/^/# /' "$folder/module.log"
         skip "the module gpio-sim does not build against $headers"
     fi
-    mv "$work/module/gpio-simulated.ko" "$work/module/$release.ko"
-    sh "$work/source/scripts/extract-vmlinux" "$work/image/boot/vmlinuz-$release" >"$kernel" || skip "the kernel cannot be decompressed"
-    rm -rf "$work"/*.deb "$work/source"
+    mv "$folder/module/gpio-simulated.ko" "$folder/module/$release.ko"
+    sh "$folder/source/scripts/extract-vmlinux" "$folder/image/boot/vmlinuz-$release" >"$kernel" || skip "the kernel cannot be decompressed"
+    rm -rf "$folder"/*.deb "$folder/source"
 fi
 
 # The initial file system.
-rm -rf "$work/root"
-mkdir -p "$work/root/bin" "$work/root/proc" "$work/root/sys" "$work/root/dev" "$work/root/lib/modules"
-install -m 755 "$here/init" "$work/root/init"
-install -m 755 /bin/busybox "$work/root/bin/"
-install -m 755 "$program" "$work/root/bin/test_gpio_vm"
-cp "$work/module/$release.ko" "$work/root/lib/modules/gpio-simulated.ko"
+rm -rf "$folder/root"
+mkdir -p "$folder/root/bin" "$folder/root/proc" "$folder/root/sys" "$folder/root/dev" "$folder/root/lib/modules"
+install -m 755 "$here/init" "$folder/root/init"
+install -m 755 /bin/busybox "$folder/root/bin/"
+install -m 755 "$program" "$folder/root/bin/test_gpio_vm"
+cp "$folder/module/$release.ko" "$folder/root/lib/modules/gpio-simulated.ko"
 if [ -e "$modules/fs/configfs/configfs.ko" ]; then
-    cp "$modules/fs/configfs/configfs.ko" "$work/root/lib/modules/configfs.ko"
+    cp "$modules/fs/configfs/configfs.ko" "$folder/root/lib/modules/configfs.ko"
 else
-    xz -dc "$modules/fs/configfs/configfs.ko.xz" >"$work/root/lib/modules/configfs.ko" || skip "no module configfs in $image"
+    xz -dc "$modules/fs/configfs/configfs.ko.xz" >"$folder/root/lib/modules/configfs.ko" || skip "no module configfs in $image"
 fi
 for l in $(ldd "$program" | grep -oE '/[^ ]+'); do
-    mkdir -p "$work/root$(dirname "$l")"
-    cp -L "$l" "$work/root$l"
+    mkdir -p "$folder/root$(dirname "$l")"
+    cp -L "$l" "$folder/root$l"
 done
-(cd "$work/root" && find . | cpio -o -H newc --quiet | gzip -1) >"$work/initrd.gz"
+(cd "$folder/root" && find . | cpio -o -H newc --quiet | gzip -1) >"$folder/initrd.gz"
 
 echo "# Linux $release in qemu, $(dpkg-query -W -f='${Package} ${Version}\n' libgpiod2 libgpiod3 2>/dev/null | head -n 1)"
-timeout 150 qemu-system-x86_64 -M pc -accel tcg -smp 2 -m 256 -kernel "$kernel" -initrd "$work/initrd.gz" \
+timeout 150 qemu-system-x86_64 -M pc -accel tcg -smp 2 -m 256 -kernel "$kernel" -initrd "$folder/initrd.gz" \
     -append "console=ttyS0 quiet loglevel=1 panic=-1" -display none -vga none -nic none -no-reboot -serial stdio -monitor none \
-    </dev/null 2>&1 | tr -d '\r' | sed 's/^\x1b\[K/# /' >"$work/console.log"
-sed -n '/^1\.\./,/^guest: exit/p' "$work/console.log" | grep -v '^guest:'
-if ! grep -q '^guest: exit 0$' "$work/console.log"; then
+    </dev/null 2>&1 | tr -d '\r' | sed 's/^\x1b\[K/# /' >"$folder/console.log"
+sed -n '/^1\.\./,/^guest: exit/p' "$folder/console.log" | grep -v '^guest:'
+if ! grep -q '^guest: exit 0$' "$folder/console.log"; then
     echo "# the machine said at the end:"
-    tail -n 15 "$work/console.log" | sed 's/^/#   /'
+    tail -n 15 "$folder/console.log" | sed 's/^/#   /'
     exit 1
 fi
