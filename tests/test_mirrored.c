@@ -96,8 +96,10 @@ static void a_mirror_shows_the_lobe_s_share_of_its_surroundings(void **state)
     static const struct { float roughness, metallic, specular; } of[] = { { .1f, 1, 0 }, { .4f, 1, 0 }, { .8f, 1, 0 }, { .2f, 0, .5f }, { .5f, 0, 1 } };
     struct scene s;
     scene_new(&s, true, from_m);
+    for (int t = 0; t < s.texels.n; t++)
+        s.theta[t][DISNEY_SPECULAR] = .5f; // the surroundings send 4 % more
     for (size_t k = 0; k < sizeof(of) / sizeof(*of); k++) {
-        const int texel = (int)((k + 1) * (size_t)s.texels.n / 7); // alone; all it shows is matt
+        const int texel = (int)((k + 1) * (size_t)s.texels.n / 7); // alone; all it shows is lit by others only
         float *theta = s.theta[texel], v[3];
         theta[DISNEY_ROUGHNESS] = of[k].roughness, theta[DISNEY_METALLIC] = of[k].metallic, theta[DISNEY_SPECULAR] = of[k].specular;
         gather(&s, 4096, 2, s.radiance);
@@ -106,7 +108,7 @@ static void a_mirror_shows_the_lobe_s_share_of_its_surroundings(void **state)
         const double nv = (double)(n[0] * v[0] + n[1] * v[1] + n[2] * v[2]);
         const double share = lobe_share((double)of[k].roughness, of[k].metallic > 0 ? 1 : .08 * (double)of[k].specular, nv);
         for (int c = 0; c < 3; c++)
-            assert_true(fabs((double)s.radiance[texel][c] / (c + 1) / share - 1) < .02);
+            assert_true(fabs((double)s.radiance[texel][c] / (1.04 * (c + 1)) / share - 1) < .02);
         memset(theta, 0, sizeof(s.theta[texel]));
     }
     scene_free(&s);
