@@ -52,6 +52,11 @@ int trigger_relay(struct trigger *t, int camera, bool cut)
     return t->ops->relay ? t->ops->relay(t->self, camera, cut) : -ENOTSUP;
 }
 
+int trigger_head(struct trigger *t, int32_t yaw_mdeg, int32_t pitch_mdeg)
+{
+    return t->ops->head ? t->ops->head(t->self, yaw_mdeg, pitch_mdeg) : -ENOTSUP;
+}
+
 int trigger_fd(const struct trigger *t)
 {
     return t->ops->fd(t->self);

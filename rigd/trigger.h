@@ -19,6 +19,8 @@ struct trigger_host {
     void (*button)(void *arg, int64_t at_ns);               // pressed, debounced
     void (*press_camera)(void *arg, int camera);            // software kind only: send CAMERA_TRIGGER now
     void (*broken)(void *arg, int err);                     // the trigger is gone; close it, open again later
+    // Once per accepted trigger_head(), when the head stands still: 0, or -EIO, -ETIME (it did not get there), -ECANCELED. NULL: unheard.
+    void (*head_arrived)(void *arg, int err);
     void *arg;
 };
 
@@ -29,6 +31,7 @@ enum { // trigger_abilities()
     TRIGGER_FEEDBACK = 8,
     TRIGGER_BUTTON = 16,
     TRIGGER_RELAYS = 32,
+    TRIGGER_HEAD = 64,        // a motorised panorama head
 };
 
 struct trigger_shot {
@@ -51,6 +54,10 @@ void trigger_release(struct trigger *t); // at once, also in the middle of a sho
 // Cut (true) or give (false) the supply of one camera; after max_hold_ms it is given back anyway. 0, -ENOTSUP, -EIO.
 int trigger_relay(struct trigger *t, int camera, bool cut);
 
+// Turn the panorama head, in thousandths of a degree from where it stood when it was last homed: yaw to the left seen from above,
+// pitch up. 0 (head_arrived() will come), -EBUSY (it moves, or a shot is pending), -EINVAL (beyond its limits), -ENOTSUP, -EIO.
+int trigger_head(struct trigger *t, int32_t yaw_mdeg, int32_t pitch_mdeg);
+
 // For the loop: when fd is readable, call dispatch.
 int trigger_fd(const struct trigger *t);
 void trigger_dispatch(struct trigger *t);
@@ -65,6 +72,7 @@ struct trigger_ops {
     int (*fire)(void *self, const struct trigger_shot *shot);
     void (*release)(void *self);
     int (*relay)(void *self, int camera, bool cut); // NULL: none
+    int (*head)(void *self, int32_t yaw_mdeg, int32_t pitch_mdeg); // NULL: none
     int (*fd)(const void *self);
     void (*dispatch)(void *self);
     void (*close)(void *self);
