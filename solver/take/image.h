@@ -60,6 +60,15 @@ struct image_note {
 };
 int image_write_exr_rows(const struct image_rows *rows, const struct image_note *notes, int n_notes, const char *path,
                          enum image_type type, enum image_compression compression);
+// 16-bit RGB TIFF, uncompressed, from rows made in the same way (row fills [width][3]), with the usual EXIF; NULL, "" and 0 are left
+// out. Atomic. 0 or -errno (logged).
+struct image_exif {
+    const char *make, *model, *serial, *lens, *description;
+    const char *date, *subseconds; // "2026:11:22 12:34:56", "123"
+    double time_s, f_number, focal_mm, iso;
+};
+int image_write_tiff16(const char *path, int width, int height, const struct image_exif *exif,
+                       int (*row)(void *arg, int y, uint16_t *rgb), void *arg);
 // The text of a note of a scanline EXR whose last lines are there. 0, -errno of the open, -EINVAL (no EXR, or cut short), -ENODATA (no
 // such note, or a number), -EFBIG (room is the size of text). Not logged.
 int image_read_note(const char *path, const char *name, char *text, size_t room);
