@@ -48,10 +48,10 @@ FUZZED := $(LIBRARY) $(RIG) $(RIGSIM_LIB) # what a fuzzer calls of these is link
 
 # ---- rules --------------------------------------------------------------------------------------------------------------
 object = $(patsubst %.c,$(BUILD)/obj/%.o,$(1))
-ifneq ($(filter test test-vm demo bench bench-rig chart figure5 figures stability experiments,$(MAKECMDGOALS)),)
+ifneq ($(filter test test-vm demo bench bench-develop bench-rig chart figure5 figures stability experiments,$(MAKECMDGOALS)),)
 FIRST := deps # these install what is missing before the first file is compiled
 endif
-.PHONY: all deps deps-fuzz deps-bench test test-vm demo bench bench-rig chart figure5 figures stability experiments fuzz check-includes man install clean help
+.PHONY: all deps deps-fuzz deps-bench test test-vm demo bench bench-develop bench-rig chart figure5 figures stability experiments fuzz check-includes man install clean help
 .DELETE_ON_ERROR:
 .SECONDARY:
 
@@ -168,6 +168,8 @@ bench: deps $(BENCH_PROGRAMS) $(BUILD)/bin/rigsolve
 RIG_BENCHES ?= scale faults soak lag full eio kills
 bench-rig: deps all
 	@for b in $(RIG_BENCHES); do echo "== $$b"; BIN=$(BUILD)/bin perl tests/bench/rig.pl $$b || failed=1; done; [ -z "$$failed" ]
+bench-develop: deps all $(BUILD)/tests/bench/raws
+	@BIN=$(BUILD)/bin RAWS=$(BUILD)/tests/bench/raws sh tests/bench/develop.sh
 experiments: deps $(BUILD)/bin/rigsolve $(BUILD)/tests/bench/judge
 	@BIN=$(BUILD)/bin JUDGE=$(BUILD)/tests/bench/judge sh tests/bench/experiments.sh
 chart: deps deps-bench $(BUILD)/tests/bench/chart_lights
@@ -226,6 +228,7 @@ help:
 	@echo 'make test-vm    GPIO on a simulated chip, in a virtual machine'
 	@echo 'make bench      seconds and errors of kernels     make chart     speed against accuracy      make stability  where it fails'
 	@echo 'make bench-rig  the rig with simulated cameras: kills, faults, scale, soak, lag, disks (half an hour; RIG_BENCHES="lag soak")'
+	@echo 'make bench-develop  raws to radiance: seconds and MB per 24-megapixel frame, 85 of them sustained'
 	@echo 'make install    DESTDIR= PREFIX=/usr/local        make deps      Debian packages             make clean'
 	@echo 'variants: VARIANT=debug|asan|tsan; V=1 shows commands'
 -include $(shell find $(BUILD)/obj $(BUILD)/fuzz -name '*.d' 2>/dev/null)
