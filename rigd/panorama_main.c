@@ -275,9 +275,10 @@ static struct json *describe_frame(const struct shot *s)
 static void judge_steps(struct job *j, const struct panorama_stop *stop, const struct shot *shot, int n)
 {
     const struct shot *longer = NULL;
-    for (int i = 0; i < n; i++) {
+    for (int i = 0; i < n; i++)
         if (shot[i].report.fault != BRACKET_FITS)
-            continue;
+            return; // which is named already
+    for (int i = 0; i < n; i++) {
         if (longer && log2(longer->h / shot[i].h) > usual_gap_ev)
             find(j, DOUBT, "missing_frame", stop->name, shot[i].frame->file, "%.1f EV below the next longer frame: is one missing between them?",
                  log2(longer->h / shot[i].h));
@@ -346,7 +347,8 @@ static int do_stop(struct job *j, struct stitch *stitch, const struct panorama_s
         json_append(frames, describe_frame(shot + i));
     }
     json_set(to, "frames", frames);
-    judge_steps(j, stop, shot, n);
+    if (n == stop->n_frames)
+        judge_steps(j, stop, shot, n);
     if (!b || !n_used || !is_same_camera(j, stop, &facts)) {
         if (!b || !n_used)
             find(j, DOUBT, "missing_stop", stop->name, NULL, "none of its %d frames can be used: what it would have seen stays uncovered", stop->n_frames);
