@@ -35,8 +35,8 @@ endif
 TAKE := $(wildcard solver/take/*.c)
 LIBRARY := $(TAKE) $(filter-out solver/main.c,$(wildcard solver/*.c)) $(wildcard solver/kernels/*.c)
 COMMANDS := $(wildcard solver/commands/*.c)
-RIG_PROGRAMS := rigctl rigd rigd-camera rigd-develop rigd-unpack
-RIG := $(filter-out $(addprefix rigd/,camera_gphoto.c camera_worker.c daemon.c develop.c develop_main.c main.c rigctl.c rigctl_develop.c unpack.c),$(wildcard rigd/*.c))
+RIG_PROGRAMS := rigctl rigd rigd-camera rigd-develop rigd-panorama rigd-unpack
+RIG := $(filter-out $(addprefix rigd/,camera_gphoto.c camera_worker.c daemon.c develop.c develop_main.c main.c panorama_main.c rigctl.c rigctl_develop.c unpack.c),$(wildcard rigd/*.c))
 RIGSIM := $(wildcard tests/rigsim/*.c)
 RIGSIM_LIB := $(filter-out $(addprefix tests/rigsim/,client.c main.c server.c server_faults.c server_shutter.c),$(RIGSIM))
 LIBS_RIG = -ljansson -linih -lsystemd -lxxhash -lgpiod -lm
@@ -95,6 +95,8 @@ $(BUILD)/bin/rigd-unpack: $(call object,rigd/develop.c rigd/exif.c rigd/unpack.c
 	$(link_rig) $(LIBS_RAW) -o $@
 $(BUILD)/bin/rigd-develop: $(call object,rigd/develop.c rigd/develop_main.c) $(BUILD)/librig.a $(BUILD)/libtake.a
 	$(link_rig) $(LIBS_RAW) -lOpenEXRCore -ltiff -lpng -ljpeg -ljansson -lxxhash -o $@
+$(BUILD)/bin/rigd-panorama: $(call object,rigd/develop.c rigd/panorama_main.c) $(BUILD)/librig.a $(BUILD)/libtake.a
+	$(link_rig) -lOpenEXRCore -ltiff -lpng -ljpeg -ljansson $(LIBS_RAW) -o $@
 $(BUILD)/bin/rigsim: $(call object,$(filter-out %/client.c,$(RIGSIM))) $(BUILD)/libstudiorig.a
 	@mkdir -p $(@D)
 	@$(if $(V),,echo '  LD $@')
@@ -112,6 +114,7 @@ $(BUILD)/tests/test_developing: | $(BUILD)/bin/rigd-develop $(BUILD)/bin/rigctl
 $(BUILD)/tests/test_develop: | $(BUILD)/bin/rigd-unpack
 $(BUILD)/tests/test_develop: $(call object,rigd/develop.c)
 $(BUILD)/tests/test_develop: LIBS += $(LIBS_RAW)
+$(BUILD)/tests/test_rigd_panorama: | $(BUILD)/bin/rigd-panorama
 $(BUILD)/tests/bench/stability_joint: $(call object,solver/commands/arguments.c)
 $(BUILD)/obj/tests/test_usb_camera.o $(BUILD)/obj/tests/usb/usb_camera.o: CFLAGS_ALL += $(shell pkg-config --cflags umockdev-1.0 2>/dev/null)
 $(BUILD)/tests/test_usb_camera: LIBS += $(shell pkg-config --libs umockdev-1.0 2>/dev/null)
