@@ -38,7 +38,7 @@ COMMANDS := $(wildcard solver/commands/*.c)
 RIG_PROGRAMS := rigctl rigd rigd-camera rigd-unpack
 RIG := $(filter-out $(addprefix rigd/,camera_gphoto.c camera_worker.c daemon.c develop.c main.c rigctl.c unpack.c),$(wildcard rigd/*.c))
 RIGSIM := $(wildcard tests/rigsim/*.c)
-RIGSIM_LIB := $(filter-out $(addprefix tests/rigsim/,client.c main.c server.c server_faults.c server_shutter.c),$(RIGSIM))
+RIGSIM_LIB := $(filter-out $(addprefix tests/rigsim/,client.c main.c server.c server_faults.c server_head.c server_shutter.c),$(RIGSIM))
 LIBS_RIG = -ljansson -linih -lsystemd -lxxhash -lgpiod -lm
 LIBS_CAMERA = -lgphoto2 -lgphoto2_port -ljansson -lxxhash -lm
 TESTS := $(basename $(notdir $(wildcard tests/test_*.c))) check_kernels
@@ -92,7 +92,7 @@ $(BUILD)/bin/rigd-camera: $(call object,rigd/camera_gphoto.c rigd/camera_worker.
 	$(link_rig) $(LIBS_CAMERA) -o $@
 $(BUILD)/bin/rigd-unpack: $(call object,rigd/develop.c rigd/unpack.c)
 	$(link_rig) -lraw_r -o $@
-$(BUILD)/bin/rigsim: $(call object,$(filter-out %/client.c,$(RIGSIM))) $(BUILD)/libstudiorig.a
+$(BUILD)/bin/rigsim: $(call object,$(filter-out %/client.c,$(RIGSIM))) $(BUILD)/librig.a $(BUILD)/libstudiorig.a
 	@mkdir -p $(@D)
 	@$(if $(V),,echo '  LD $@')
 	$(Q)$(CC) $(CFLAGS_ALL) $^ $(LIBS) -o $@

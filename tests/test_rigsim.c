@@ -677,7 +677,7 @@ static void a_frame_follows_time_aperture_iso_and_colour(void **state)
     rig_open(&r, "generic", 0, 5, scratch_dir);
     const struct personality *p = &r.personality;
     const double range = p->white_level - p->black_level;
-    static const struct exposure cases[] = { { 1, 0, 0, 0x1p-7, 8, 100 }, { 2, 0, 0, 0x1p-8, 8, 100 }, { 3, 0, 0, 0x1p-7, 16, 100 },
+    static const struct exposure cases[] = { { 1, 0, 0, 0x1p-7, 8, 100, { 0 } }, { 2, 0, 0, 0x1p-8, 8, 100, { 0 } }, { 3, 0, 0, 0x1p-7, 16, 100, { 0 } },
                                              { 4, 0, 0, 0x1p-7, 8, 200 }, { 5, 0, 0, 0x1p-9, 8, 400 } };
     for (size_t i = 0; i < sizeof(cases) / sizeof(cases[0]); i++) {
         const struct exposure *e = &cases[i];
