@@ -677,8 +677,8 @@ static void a_frame_follows_time_aperture_iso_and_colour(void **state)
     rig_open(&r, "generic", 0, 5, scratch_dir);
     const struct personality *p = &r.personality;
     const double range = p->white_level - p->black_level;
-    static const struct exposure cases[] = { { 1, 0, 0, 0x1p-7, 8, 100, { 0 } }, { 2, 0, 0, 0x1p-8, 8, 100, { 0 } }, { 3, 0, 0, 0x1p-7, 16, 100, { 0 } },
-                                             { 4, 0, 0, 0x1p-7, 8, 200, { 0 } }, { 5, 0, 0, 0x1p-9, 8, 400, { 0 } } };
+    static const struct exposure cases[] = { { .shot = 1, .time_s = 0x1p-7, .f_number = 8, .iso = 100 }, { .shot = 2, .time_s = 0x1p-8, .f_number = 8, .iso = 100 }, { .shot = 3, .time_s = 0x1p-7, .f_number = 16, .iso = 100 },
+                                             { .shot = 4, .time_s = 0x1p-7, .f_number = 8, .iso = 200 }, { .shot = 5, .time_s = 0x1p-9, .f_number = 8, .iso = 400 } };
     for (size_t i = 0; i < sizeof(cases) / sizeof(cases[0]); i++) {
         const struct exposure *e = &cases[i];
         const double k = e->time_s / p->t_ref_s * pow(p->n_ref / e->f_number, 2) * e->iso / 100;
