@@ -13,6 +13,7 @@
 #include <dirent.h>
 #include <errno.h>
 #include <fcntl.h>
+#include <math.h>
 #include <stdio.h>
 #include <stdlib.h>
 #include <string.h>
@@ -26,6 +27,7 @@ static const char *const state_names[TAKE_N_STATES] = {
 };
 static const char *const object_states[OBJECT_N_STATES] = { "found", "copied", "deleted", "gone" };
 static const char *const debts[] = { "open", "paid", "missed" };
+static const char *const processings[LEDGER_N_PROCESSING] = { "none", "owed", "settled", "cancelled" };
 
 const char *take_state_name(enum take_state s)
 {
@@ -182,6 +184,35 @@ static struct json *camera_json(const struct ledger_camera *c)
         json_append(list, s);
     }
     json_set(v, "settings", list);
+    if (c->developed[0]) {
+        struct json *d = json_new_object();
+        json_set_string(d, "file", c->developed);
+        json_set_number(d, "clipped_share", c->clipped_share);
+        json_set_number(d, "seconds", c->developed_s);
+        json_set(v, "developed", d);
+    }
+    return v;
+}
+
+static struct json *processing_json(const struct ledger *l)
+{
+    struct json *v = json_new_object(), *notes = json_new_array(), *solves = json_new_array();
+    json_set_string(v, "state", processings[l->processing]);
+    put(v, "panorama_from", l->panorama_from);
+    for (int i = 0; i < l->n_notes; i++)
+        json_append_string(notes, l->process_note[i]);
+    for (int i = 0; i < l->n_solves; i++) {
+        const struct ledger_solve *s = &l->solve[i];
+        struct json *o = json_new_object();
+        json_set_string(o, "name", s->name);
+        json_set_bool(o, "trusted", s->trusted);
+        json_set_number(o, "rmse_held_out_percent", s->rmse_held_out_percent); // not held out: null
+        json_set_number(o, "seconds", s->seconds);
+        put(o, "why", s->why);
+        json_append(solves, o);
+    }
+    json_set(v, "notes", notes);
+    json_set(v, "solves", solves);
     return v;
 }
 
@@ -203,6 +234,8 @@ char *ledger_text(const struct ledger *l)
     json_set_int(shot, "n_measured", l->n_measured);
     json_set_int(shot, "jitter_ns", l->jitter_ns);
     json_set(doc, "shot", shot);
+    if (l->processing)
+        json_set(doc, "processing", processing_json(l));
     for (int i = 0; i < l->n_cameras; i++)
         json_append(list, camera_json(&l->camera[i]));
     json_set(doc, "cameras", list);
@@ -281,6 +314,15 @@ static int get_length(struct reader *r, const char *key, int most)
     return n;
 }
 
+static double get_number(struct reader *r, const char *key, double missing)
+{
+    double n = missing;
+    const int err = json_get_number(r->v, key, &n);
+    if (err && err != -ENOENT && !(isnan(missing) && json_get(r->v, key))) // null is a number that is not there
+        complain(r, key, "a number");
+    return err ? missing : n;
+}
+
 static struct reader child(const struct reader *parent, const char *list, int i)
 {
     char key[40];
@@ -303,6 +345,50 @@ static void get_object(struct reader *r, struct camera_object *o)
     o->size_bytes = get_int(r, "size", -1, INT64_MAX, -1);
     if (o->folder[0] != '/' || !o->name[0] || strchr(o->name, '/') || o->name[0] == '.')
         complain(r, "name", "a file on a card");
+}
+
+static void get_developed(struct reader *r, struct ledger_camera *c)
+{
+    struct reader d = { .v = json_get(r->v, "developed"), .file = r->file };
+    snprintf(d.where, sizeof(d.where), "%.25s.developed", r->where);
+    if (!d.v)
+        return;
+    get_string(&d, "file", c->developed, sizeof(c->developed));
+    c->clipped_share = get_number(&d, "clipped_share", 0);
+    c->developed_s = get_number(&d, "seconds", 0);
+    if (strncmp(c->developed, "linear/", 7) || c->developed[7] == '.' || strchr(c->developed + 7, '/'))
+        complain(&d, "file", "a file of linear/");
+    r->bad |= d.bad;
+}
+
+static void get_processing(struct reader *r, struct ledger *l)
+{
+    struct reader p = { .v = json_get(r->v, "processing"), .file = r->file, .where = "processing" };
+    if (!p.v)
+        return;
+    l->processing = get_word(&p, "state", processings, LEDGER_N_PROCESSING);
+    get_string(&p, "panorama_from", l->panorama_from, sizeof(l->panorama_from));
+    l->n_notes = get_length(&p, "notes", LEDGER_NOTES_MAX);
+    for (int i = 0; i < l->n_notes; i++) {
+        char key[20];
+        snprintf(key, sizeof(key), "notes.%d", i);
+        get_string(&p, key, l->process_note[i], sizeof(l->process_note[i]));
+    }
+    l->n_solves = get_length(&p, "solves", LEDGER_SOLVES_MAX);
+    for (int i = 0; i < l->n_solves; i++) {
+        struct ledger_solve *s = &l->solve[i];
+        struct reader e = child(&p, "solves", i);
+        get_string(&e, "name", s->name, sizeof(s->name));
+        if (!is_plain(s->name))
+            complain(&e, "name", "letters, digits, - and _");
+        s->trusted = get_bool(&e, "trusted");
+        s->rmse_held_out_percent = get_number(&e, "rmse_held_out_percent", NAN);
+        s->seconds = get_number(&e, "seconds", 0);
+        get_string(&e, "why", s->why, sizeof(s->why));
+        p.bad |= e.bad;
+    }
+    if (p.bad)
+        r->bad = true;
 }
 
 static void get_camera(struct reader *r, struct ledger_camera *c)
@@ -337,6 +423,7 @@ static void get_camera(struct reader *r, struct ledger_camera *c)
         f->equal = !strcmp(f->wanted, f->found);
         r->bad |= e.bad;
     }
+    get_developed(r, c);
     c->n_objects = get_length(r, "objects", LEDGER_OBJECTS_MAX);
     for (int i = 0; i < c->n_objects; i++) {
         struct ledger_object *o = &c->object[i];
@@ -388,6 +475,7 @@ int ledger_parse(struct ledger *out, const char *text, size_t n_bytes, const cha
         out->n_measured = (int)get_int(&shot, "n_measured", 0, CONFIG_CAMERAS_MAX, 0);
         out->jitter_ns = get_int(&shot, "jitter_ns", INT64_MIN, INT64_MAX, -1);
     }
+    get_processing(&r, out);
     const int n = get_length(&r, "cameras", 4 * CONFIG_CAMERAS_MAX);
     out->camera = calloc((size_t)n + 1, sizeof(*out->camera));
     if (!out->camera) {

@@ -28,6 +28,24 @@ struct ledger_object {
     int64_t copied_ms;   // from the shot until the copy was safe; -1 not known
 };
 
+// What happens after the frames are here (processing.h).
+enum ledger_processing {
+    LEDGER_UNPROCESSED, // not asked for
+    LEDGER_OWED,        // begins, or goes on, with the next start
+    LEDGER_SETTLED,     // all done, or notes say what is missing
+    LEDGER_CANCELLED,
+    LEDGER_N_PROCESSING
+};
+enum { LEDGER_NOTES_MAX = 12, LEDGER_NOTE_BYTES = 240, LEDGER_SOLVES_MAX = 3 };
+
+struct ledger_solve {
+    char name[16];                // preview, standard, final: solve/<name>
+    bool trusted;
+    double rmse_held_out_percent; // NAN: none was held out
+    double seconds;
+    char why[200];                // why it is not to be trusted
+};
+
 enum debt { DEBT_OPEN, DEBT_PAID, DEBT_MISSED }; // all expected objects copied | given up, see note
 
 struct ledger_camera {
@@ -47,6 +65,8 @@ struct ledger_camera {
     struct camera_setting_found setting[CAMERA_SETTINGS_MAX]; // read back
     int n_objects;
     struct ledger_object object[LEDGER_OBJECTS_MAX];
+    char developed[64];         // "linear/A01.exr"; ""
+    double clipped_share, developed_s; // of it: photosites that are clipped; seconds it took
 };
 
 struct ledger {
@@ -61,6 +81,12 @@ struct ledger {
     int64_t spread_ns, sigma_ns; // over measured bodies; -1: not measured
     int n_measured;
     int64_t jitter_ns;          // how late the press was; -1
+    enum ledger_processing processing;
+    char panorama_from[96];     // the panorama take whose panorama.exr this one's is; "": none, or its own
+    int n_notes;                // what went wrong in processing, or is worth knowing: camera, slot, file, remedy
+    char process_note[LEDGER_NOTES_MAX][LEDGER_NOTE_BYTES];
+    int n_solves;
+    struct ledger_solve solve[LEDGER_SOLVES_MAX];
     int n_cameras;
     struct ledger_camera *camera; // in the order of the configuration
 };
