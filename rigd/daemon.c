@@ -59,6 +59,7 @@ struct job {
     char dir[600], id[96]; // of the take, or of all takes
     char *text;
     const struct config *config; // does not change
+    enum take_kind kind;
     struct ledger ledger;
     struct manifest_known *known;
     int n_known;
@@ -214,7 +215,7 @@ static void done_space(struct daemon *d, struct job *j)
 
 static void work_create(struct job *j)
 {
-    j->err = j->text ? ledger_create(j->text, j->id, j->dir) : -ENOMEM;
+    j->err = j->text ? ledger_create(j->text, j->kind, j->id, j->dir) : -ENOMEM;
 }
 
 static void work_commit(struct job *j)
@@ -1079,6 +1080,7 @@ static void obey(struct daemon *d, const struct rig_action *a)
         return;
     case RIG_CREATE:
         j = new_job(work_create, done_commit);
+        j->kind = l->kind;
         j->text = ledger_text(l);
         snprintf(j->dir, sizeof(j->dir), "%s", d->takes_dir);
         snprintf(j->id, sizeof(j->id), "%s", l->id);
