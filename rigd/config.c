@@ -663,7 +663,7 @@ static void check_lines(struct reader *r)
         use_line(r, uses, &n, k->feedback_line, k->name, "feedback_line", r->camera_line[i]);
         use_line(r, uses, &n, k->relay_line, k->name, "relay_line", r->camera_line[i]);
         half |= t->kind != TRIGGER_SOFTWARE && k->half_line != CONFIG_NONE;
-        if (t->kind == TRIGGER_GPIO && k->full_line == CONFIG_NONE && t->full_line == CONFIG_NONE && i != c->panorama.camera)
+        if (t->kind == TRIGGER_GPIO && k->full_line == CONFIG_NONE && t->full_line == CONFIG_NONE && i != config_panorama_camera(c))
             complain(r, r->camera_line[i], "camera \"%s\" has no full_line and [trigger] has none for all; nothing would press it", k->name);
     }
     free(uses);

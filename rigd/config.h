@@ -46,8 +46,8 @@ enum head_kind { HEAD_NONE, HEAD_MANUAL, HEAD_BOARD }; // the camera stays where
 struct config_stop { double yaw_deg, pitch_deg; }; // as trigger_head(): yaw to the left seen from above, pitch up
 
 struct panorama_config {     // [panorama]
-    int camera;              // its number; it takes no part in ordinary takes. CONFIG_NONE: there is no [panorama]
-    char camera_name[24];
+    char camera_name[24];    // "": there is no [panorama]
+    int camera;              // its number: config_panorama_camera()
     enum head_kind head;
     struct lens lens;
     double max_angle_deg;
@@ -87,6 +87,12 @@ struct config {
     int n_cameras;
     struct config_camera *camera; // in the file's order: the camera numbers of all of rigd
 };
+
+// The number of the camera that makes panoramas and takes no part in ordinary takes. CONFIG_NONE: there is none.
+static inline int config_panorama_camera(const struct config *c)
+{
+    return c->panorama.camera_name[0] ? c->panorama.camera : CONFIG_NONE;
+}
 
 // 0; -ENOENT..., -EINVAL (every finding logged, at most 20). *out is zeroed on failure.
 int config_read(struct config *out, const char *path);

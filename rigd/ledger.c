@@ -52,7 +52,7 @@ void ledger_init(struct ledger *l, const struct config *config)
         memcpy(c->port, config->camera[i].port, sizeof(c->port));
         memcpy(c->serial, config->camera[i].serial, sizeof(c->serial));
         c->battery_percent = -1;
-        c->expected = i != config->panorama.camera;
+        c->expected = i != config_panorama_camera(config);
         c->lag_ns = INT64_MIN;
     }
 }
