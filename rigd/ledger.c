@@ -472,7 +472,6 @@ static void get_exposure(struct reader *r, struct ledger_camera *c)
     struct reader v = { .v = json_get(r->v, "exposure"), .file = r->file };
     struct ledger_exposure *e = &c->exposure;
     snprintf(v.where, sizeof(v.where), "%.25s.exposure", r->where);
-    e->object = -1;
     if (!v.v)
         return;
     c->is_exposure = true;
@@ -540,7 +539,7 @@ static void get_camera(struct reader *r, struct ledger_camera *c)
     get_developed(r, c);
     get_exposure(r, c);
     c->n_objects = get_length(r, "objects", LEDGER_OBJECTS_MAX);
-    if (c->exposure.object >= c->n_objects)
+    if (c->is_exposure && c->exposure.object >= c->n_objects)
         complain(r, "exposure.object", "one of its objects");
     for (int i = 0; i < c->n_objects; i++) {
         struct ledger_object *o = &c->object[i];
