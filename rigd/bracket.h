@@ -35,6 +35,7 @@ struct bracket_statistics { // of one frame; [3]: red, green, blue
     double first_percentile[3], median[3]; // of y
     int plateau_dn;     // DN at which the sensor really clips where that is below the file's word for it; else 0
 };
+int bracket_plateau(const struct raw_frame *f);
 // lens: sites that it does not see (outside its circle) do not count; NULL: all count. 0 or -ENOMEM.
 int bracket_measure(struct bracket_statistics *out, const struct raw_frame *f, const struct lens *lens);
 
@@ -92,7 +93,7 @@ struct bracket_frame_report {
     // Against the frames before it, where both see: brightness over what its exposure says (1; median of blocks), its standard error; 0
     // blocks compared: 1 and infinite.
     double gain, gain_error;
-    int n_blocks, n_changed;   // compared; significantly changed beyond noise and gain (by at least change_least)
+    int n_blocks, n_changed;   // compared; changed beyond noise and gain, and by 2 % at least
     int largest_change;        // blocks in the largest patch of them: movement where frames differ in time, flicker where they are repeats
     double changed_at_px[2];   // its middle
     double change;             // brightness there over what was expected
@@ -107,7 +108,7 @@ int bracket_new(struct bracket **out, const struct raw_frame *first, const struc
 // Longest first (comparisons need the better frame first; the estimate does not depend on it but for rounding and weights). exposure_s:
 // the true time where it is known better, or 0: f's own. 0 or -ENOMEM; the verdict is in *report.
 int bracket_add(struct bracket *b, const struct raw_frame *f, double exposure_s, struct bracket_frame_report *report);
-// What so far. Frees b's sums; b is gone afterwards. -ENODATA: no frame was taken in.
+// Ends b, whatever comes of it. 0; -ENODATA: no frame was taken in.
 int bracket_finish(struct merged *out, struct bracket *b, int64_t *n_clipped, int64_t *n_defects);
 void bracket_free(struct bracket *b); // NULL allowed
 void merged_free(struct merged *m);

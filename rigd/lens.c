@@ -257,6 +257,18 @@ double lens_shading(const struct lens *l, const double px[2])
     return 1 + t * (l->v[0] + t * (l->v[1] + t * l->v[2]));
 }
 
+double lens_reach_px(const struct lens *l)
+{
+    double reach = 0;
+    for (int i = 0; i < 64; i++) {
+        const double b = 2 * M_PI * i / 64, u[2] = { l->max_r * cos(b), l->max_r * sin(b) };
+        double d[2], J[4];
+        distort(l, u, d, J);
+        reach = fmax(reach, l->focal_px * hypot(d[0], d[1]));
+    }
+    return l->circle_px > 0 ? fmin(reach, l->circle_px) : reach;
+}
+
 void lens_head(double R[9], double yaw, double pitch, double roll)
 {
     const double cy = cos(yaw), sy = sin(yaw), cp = cos(pitch), sp = sin(pitch), cr = cos(roll), sr = sin(roll);

@@ -42,6 +42,8 @@ bool lens_ray(const struct lens *lens, const double px[2], double dir[3]);
 // Steradians per square pixel at px; 0 where lens_ray is false.
 double lens_solid_angle(const struct lens *lens, const double px[2]);
 double lens_shading(const struct lens *lens, const double px[2]);
+// No pixel further than this from centre_px is seen.
+double lens_reach_px(const struct lens *lens);
 
 // The head holds the camera: yaw to the left seen from above, then pitch up, then roll: the camera turns clockwise seen from behind
 // it. All 0: it looks along the probe's +Z (the panorama's middle) with +Y upwards, so that x (right in the image) is the probe's -X.
