@@ -498,6 +498,9 @@ static void obey(const struct rig_action *a)
             w.silent_until_ns = 0; // no shot
         break;
     case RIG_IDENTIFIED:
+    case RIG_HEAD:
+    case RIG_PROMPT:
+    case RIG_PROGRESS:
         break;
     }
 }
@@ -661,7 +664,7 @@ static void tear_down(void)
 static const struct ledger *capture_as(const char *id, bool without_missing)
 {
     char why[200] = "";
-    const struct rig_take take = { id, "story", "2026-11-22T09:00:00Z", 1795338000000, "/takes" };
+    const struct rig_take take = { id, "story", "2026-11-22T09:00:00Z", 1795338000000, "/takes", NULL };
     w.n_copies = 0;
     w.has_durable = false;
     for (int i = 0; i < w.config.n_cameras; i++)
@@ -836,7 +839,7 @@ static void nothing_is_sent_from_the_last_answer_before_half_press_to_the_end_of
     (void)state;
     for (int calibrated = 0; calibrated < 2; calibrated++)
         for (int ms = 0; ms < 3000; ms += 50) {
-            const struct rig_take take = { "20261122T090000_story", "story", "2026-11-22T09:00:00Z", 1795338000000, "/takes" };
+            const struct rig_take take = { "20261122T090000_story", "story", "2026-11-22T09:00:00Z", 1795338000000, "/takes", NULL };
             struct lag lag[5];
             char why[200];
             set_up(5, 200 + (uint64_t)ms);
@@ -1091,7 +1094,7 @@ static void a_trigger_that_fails_is_survived(void **state)
     assert_int_equal(l->state, TAKE_VERIFIED);
     rig_trigger_is(w.rig, w.now, -1);
     char why[200];
-    const struct rig_take take = { "x", "x", "", 0, "/takes" };
+    const struct rig_take take = { "x", "x", "", 0, "/takes", NULL };
     assert_int_equal(rig_capture(w.rig, w.now, &take, false, why), -ENOTCONN);
     tear_down();
 }
@@ -1179,7 +1182,7 @@ static void a_take_is_resumed_from_its_ledger(void **state)
             name_object(&old.camera[4].until[0], w.camera[4].n_card - 1);
         }
         char why[200];
-        assert_int_equal(rig_resume(w.rig, w.now, &old, "/takes", why), 0);
+        assert_int_equal(rig_resume(w.rig, w.now, &old, "/takes", true, why), 0);
         run(120 * S, true);
         drain_actions();
         const struct ledger *l = rig_ledger(w.rig);
@@ -1207,7 +1210,7 @@ static void a_take_that_was_never_exposed_says_so(void **state)
             old.camera[i].n_before = 1;
             name_object(&old.camera[i].before[0], w.camera[i].n_card);
         }
-    assert_int_equal(rig_resume(w.rig, w.now, &old, "/takes", why), 0);
+    assert_int_equal(rig_resume(w.rig, w.now, &old, "/takes", true, why), 0);
     run(60 * S, true);
     drain_actions();
     assert_int_equal(rig_ledger(w.rig)->state, TAKE_FAILED);
@@ -1222,7 +1225,7 @@ static void cancelling_before_the_shot_costs_nothing_after_it_no_frame(void **st
         char why[200];
         set_up(4, 80);
         open_all();
-        const struct rig_take take = { "20261122T090000_c", "c", "", 0, "/takes" };
+        const struct rig_take take = { "20261122T090000_c", "c", "", 0, "/takes", NULL };
         for (int i = 0; i < 4; i++)
             w.camera[i].take_first = w.camera[i].n_card + 1;
         assert_int_equal(rig_capture(w.rig, w.now, &take, false, why), 0);
