@@ -291,7 +291,7 @@ int rig_may_begin(const struct rig *r, bool needs_trigger, char *why)
 }
 
 // The ledger is the caller's to fill.
-void rig_new_ledger(struct rig *r, const struct rig_take *take)
+void rig_new_ledger(struct rig *r)
 {
     ledger_free(&r->ledger);
     r->has_ledger = true;
