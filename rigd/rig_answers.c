@@ -1,6 +1,7 @@
 // rigd/rig_answers.c - what a camera's worker answered, and what follows from it.
 #include "rigd/rig_inside.h"
 
+#include <errno.h>
 #include <math.h>
 #include <stdio.h>
 #include <string.h>
