@@ -47,5 +47,5 @@ int stitch_finish(struct image *out, struct stitch *s, const double rgb_from_cam
 void stitch_free(struct stitch *s); // NULL allowed
 
 // The clipped lights, uncovered directions and sums of a panorama with such channels, or of one without: then a plateau (at least 8 touching
-// texels within 1e-3 of the picture's highest value, where the picture is not flat) counts as clipped.
-void panorama_examine(struct panorama_report *report, const struct image *panorama);
+// texels within 1e-3 of the picture's highest value, where the picture is not flat) counts as clipped. 0 or -ENOMEM.
+int panorama_examine(struct panorama_report *report, const struct image *panorama);
