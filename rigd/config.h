@@ -40,6 +40,32 @@ struct trigger_config {      // [trigger]
     uint32_t max_hold_ms;    // no line stays pressed longer, whatever anyone asks; at most 10000
 };
 
+enum demosaic { DEMOSAIC_AHD, DEMOSAIC_BILINEAR, DEMOSAIC_HALF };
+enum solve_then { SOLVE_THEN_OFF, SOLVE_THEN_STANDARD, SOLVE_THEN_FINAL };
+
+// What happens once the frames are here. Without a [develop] section: nothing; without [solve]: no solve.
+struct process_config {
+    // [develop]
+    bool develop;             // after = on
+    enum demosaic demosaic;
+    char flat[256];           // folder of <camera>.exr, "": none
+    char colour[256];         // file of all bodies, or folder of <camera>.json; "": none
+    int develop_jobs;         // frames at a time; 0: one per core
+    uint32_t memory_mb;       // of developing; 0: half of what the machine has
+    uint32_t develop_timeout_s, panorama_timeout_s;
+    // [reconstruct]
+    char command[190];        // words; the take's path is added. "": none
+    char calibrated[256];     // a fixed rig's mesh.*, cameras and start.json; "": none
+    uint32_t reconstruct_timeout_s;
+    // [solve]
+    bool preview;
+    enum solve_then then;
+    char options[190];        // words for rigsolve solve
+    int solve_threads;        // 0: all cores
+    char solve_program[256];  // "": rigsolve beside rigd
+    uint32_t solve_timeout_s;
+};
+
 struct config {
     // [rig]
     char name[64];
@@ -61,6 +87,7 @@ struct config {
     int calibration_shots;
     double lag_max_std_ms;
     struct trigger_config trigger;
+    struct process_config process;
     int n_cameras;
     struct config_camera *camera; // in the file's order: the camera numbers of all of rigd
 };

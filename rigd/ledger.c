@@ -234,6 +234,7 @@ char *ledger_text(const struct ledger *l)
     json_set_int(shot, "n_measured", l->n_measured);
     json_set_int(shot, "jitter_ns", l->jitter_ns);
     json_set(doc, "shot", shot);
+    put(doc, "panorama_take", l->panorama_take);
     if (l->processing)
         json_set(doc, "processing", processing_json(l));
     for (int i = 0; i < l->n_cameras; i++)
@@ -475,6 +476,9 @@ int ledger_parse(struct ledger *out, const char *text, size_t n_bytes, const cha
         out->n_measured = (int)get_int(&shot, "n_measured", 0, CONFIG_CAMERAS_MAX, 0);
         out->jitter_ns = get_int(&shot, "jitter_ns", INT64_MIN, INT64_MAX, -1);
     }
+    get_string(&r, "panorama_take", out->panorama_take, sizeof(out->panorama_take));
+    if (out->panorama_take[0] && !is_plain(out->panorama_take))
+        complain(&r, "panorama_take", "a folder's name");
     get_processing(&r, out);
     const int n = get_length(&r, "cameras", 4 * CONFIG_CAMERAS_MAX);
     out->camera = calloc((size_t)n + 1, sizeof(*out->camera));

@@ -82,6 +82,7 @@ struct ledger {
     int n_measured;
     int64_t jitter_ns;          // how late the press was; -1
     enum ledger_processing processing;
+    char panorama_take[96];     // the panorama take that is to light it, chosen when it was shot; "": the newest before it
     char panorama_from[96];     // the panorama take whose panorama.exr this one's is; "": none, or its own
     int n_notes;                // what went wrong in processing, or is worth knowing: camera, slot, file, remedy
     char process_note[LEDGER_NOTES_MAX][LEDGER_NOTE_BYTES];
