@@ -9,7 +9,7 @@
 #pragma once
 #include <stdbool.h>
 
-enum { EXECUTOR_JOBS_MAX = 256, EXECUTOR_WORDS_MAX = 96, EXECUTOR_LINE_MAX = 4096 };
+enum { EXECUTOR_JOBS_MAX = 256, EXECUTOR_WORDS_MAX = 96, EXECUTOR_LINE_MAX = 16384 };
 
 struct executor_command {
     char *word[EXECUTOR_WORDS_MAX + 1]; // word[0]: the program; looked for in PATH if it has no slash

@@ -38,7 +38,8 @@ const char *take_state_name(enum take_state s)
 
 void ledger_init(struct ledger *l, const struct config *config)
 {
-    *l = (struct ledger){ .objects_per_shot = config->objects_per_shot, .spread_ns = -1, .sigma_ns = -1, .jitter_ns = -1 };
+    *l = (struct ledger){ .objects_per_shot = config->objects_per_shot, .spread_ns = -1, .sigma_ns = -1, .jitter_ns = -1,
+                          .processing = config->process.develop ? LEDGER_OWED : LEDGER_UNPROCESSED };
     l->camera = calloc((size_t)config->n_cameras + 1, sizeof(*l->camera));
     if (!l->camera)
         return;

@@ -722,9 +722,9 @@ void processing_recorded(struct processing *p, int64_t now_ns, const char *take,
 
 // ---- what is wanted -----------------------------------------------------------------------------------------------------------
 
-static bool is_wanted(const struct processing *p, const struct processing_take *what, enum processing_step step)
+static bool is_wanted(const struct processing *p, const struct take *t, const struct processing_take *what, enum processing_step step)
 {
-    if (what->is_panorama)
+    if (t->is_panorama)
         return step == STEP_PANORAMA;
     return ((p->settings.wanted | what->more) & BIT(step)) != 0;
 }
@@ -747,15 +747,16 @@ int processing_add(struct processing *p, int64_t now_ns, const struct processing
         for (int s = 0; s < PROCESSING_N_STEPS; s++)
             t->step[s].began_ns = t->step[s].ended_ns = INT64_MIN;
     }
-    if (t->settled)
+    if (t->settled) {
         t->added_ns = now_ns;
+        t->is_panorama = what->is_panorama;
+    }
     for (int s = 0; s < PROCESSING_N_STEPS; s++) {
         const enum processing_state state = t->step[s].state;
         const bool again = state == PROCESSING_FAILED || state == PROCESSING_MISSING || state == PROCESSING_CANCELLED;
-        if ((state == PROCESSING_OFF && is_wanted(p, what, s)) || (again && t->settled))
+        if ((state == PROCESSING_OFF && is_wanted(p, t, what, s)) || (again && t->settled))
             begin_anew(&t->step[s]);
     }
-    t->is_panorama = what->is_panorama;
     if (t->settled) {
         t->cancelled = t->settled = false;
         t->dirty = !what->is_owed;
