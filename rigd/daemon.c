@@ -61,6 +61,7 @@ struct job {
     char dir[600], id[96]; // of the take, or of all takes
     char *text;
     const struct config *config; // does not change
+    enum take_kind kind;
     struct ledger ledger;
     struct processing_record *record;
     struct manifest_known *known;
@@ -229,7 +230,7 @@ static void done_space(struct daemon *d, struct job *j)
 
 static void work_create(struct job *j)
 {
-    j->err = j->text ? ledger_create(j->text, j->id, j->dir) : -ENOMEM;
+    j->err = j->text ? ledger_create(j->text, j->kind, j->id, j->dir) : -ENOMEM;
 }
 
 static void work_commit(struct job *j)
@@ -509,7 +510,8 @@ static int open_the_trigger(sd_event_source *source, uint64_t usec, void *arg)
     struct daemon *d = arg;
     static const char *const kinds[] = { "software (unsynchronised)", "gpio", "usb", "simulated" };
     (void)usec;
-    d->host = (struct trigger_host){ on_fired, on_feedback, on_button, on_press_camera, on_trigger_broken, d };
+    d->host = (struct trigger_host){ .fired = on_fired, .feedback = on_feedback, .button = on_button, .press_camera = on_press_camera,
+                                      .broken = on_trigger_broken, .arg = d };
     d->trigger_io = sd_event_source_disable_unref(d->trigger_io);
     trigger_close(d->trigger);
     d->trigger = NULL;
@@ -1313,6 +1315,7 @@ static void obey(struct daemon *d, const struct rig_action *a)
         return;
     case RIG_CREATE:
         j = new_job(work_create, done_commit);
+        j->kind = l->kind;
         j->text = ledger_text(l);
         snprintf(j->dir, sizeof(j->dir), "%s", d->takes_dir);
         snprintf(j->id, sizeof(j->id), "%s", l->id);

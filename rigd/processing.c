@@ -246,7 +246,7 @@ static void settle(struct processing *p, int64_t now_ns, struct take *t, enum pr
 static void describe_item(char *out, size_t room, const struct item *i)
 {
     if (i->what.name[0])
-        snprintf(out, room, "camera %.24s%s%.48s%s: %s", i->what.name, i->what.slot[0] ? " (" : "", i->what.slot, i->what.slot[0] ? ")" : "", i->text);
+        snprintf(out, room, "camera %.24s%s%.48s%s: %.150s", i->what.name, i->what.slot[0] ? " (" : "", i->what.slot, i->what.slot[0] ? ")" : "", i->text);
     else
         snprintf(out, room, "%s", i->text);
 }
@@ -628,7 +628,7 @@ void processing_looked(struct processing *p, int64_t now_ns, const char *take, e
             copy(s->other, sizeof(s->other), items[0].name);
             snprintf(s->text, sizeof(s->text), "waits for the panorama of take %.95s", items[0].name);
         } else {
-            snprintf(why, sizeof(why), "the panorama of take %.95s is not there; rigctl process %.95s makes it", items[0].name, items[0].name);
+            snprintf(why, sizeof(why), "the panorama of take %.95s is not there; rigctl process of that take makes it", items[0].name);
             settle(p, now_ns, t, step, PROCESSING_MISSING, why);
         }
     } else {

@@ -2,10 +2,10 @@
 // geometry, giving a solve its name.
 #include "rigd/products.h"
 #include "rigd/digest.h"
+#include "rigd/pieces.h"
 #include "solver/take/atomic_file.h"
 #include "solver/take/json.h"
 #include "solver/take/log.h"
-#include "solver/take/take.h"
 
 #include <dirent.h>
 #include <errno.h>
@@ -319,7 +319,6 @@ static bool is_there(const struct products *p, const struct note *n, const char 
 
 int products_open(struct products **out, const struct products_site *site, const char *id)
 {
-    char path[PATH_BYTES];
     struct products *p = calloc(1, sizeof(*p));
     int err = -ENOMEM;
     if (!p)
@@ -333,8 +332,7 @@ int products_open(struct products **out, const struct products_site *site, const
     err = ledger_read(&p->ledger, p->dir);
     if (err)
         goto fail;
-    in_take(p, path, "panorama/panorama.json");
-    p->is_panorama = !access(path, F_OK);
+    p->is_panorama = p->ledger.kind == TAKE_PANORAMA;
     err = read_notes(p);
     if (err)
         goto fail;
@@ -513,13 +511,10 @@ static bool find_panorama_take(const struct products *p, char out[96])
     for (int i = n - 1; i >= 0; i--) {
         struct ledger ledger;
         const char *name = entries[i]->d_name;
-        snprintf(path, sizeof(path), "%s/%s/panorama/panorama.json", p->site->takes_dir, name);
-        if (!found && name[0] != '.' && strlen(name) < 96 && strcmp(name, p->id) < 0 && !access(path, F_OK)) {
-            snprintf(path, sizeof(path), "%s/%s", p->site->takes_dir, name);
-            if (!ledger_read(&ledger, path)) {
-                found = ledger.state == TAKE_VERIFIED || ledger.state == TAKE_DEVELOPED || ledger.state == TAKE_SOLVED;
-                ledger_free(&ledger);
-            }
+        snprintf(path, sizeof(path), "%s/%s", p->site->takes_dir, name);
+        if (!found && name[0] != '.' && strlen(name) < 96 && strcmp(name, p->id) < 0 && !ledger_read(&ledger, path)) {
+            found = ledger.kind == TAKE_PANORAMA && (ledger.state == TAKE_VERIFIED || ledger.state == TAKE_DEVELOPED || ledger.state == TAKE_SOLVED);
+            ledger_free(&ledger);
             if (found)
                 snprintf(out, 96, "%.95s", name);
         }
@@ -568,15 +563,14 @@ static int look_at_reconstruct(struct look *l, char text[PROCESSING_TEXT])
     const struct note *note = find_note(p, STEP_RECONSTRUCT, "");
     const bool configured = c->command[0] || c->calibrated[0];
     char path[PATH_BYTES];
-    struct take *take = NULL;
-    const int err = take_open(&take, p->dir);
+    struct pieces has;
+    const int err = pieces_find(&has, p->dir);
     if (err)
         return err;
-    const bool complete = take->mesh_path && take->cameras_path;
+    const bool complete = has.mesh[0] && has.cameras[0];
     if (!complete && !configured)
         say(text, "geometry/ has no %s; name a [reconstruct] command or calibrated folder in rigd.conf, or put %s there; then rigctl process %.95s",
-            take->mesh_path ? "cameras" : take->cameras_path ? "mesh" : "mesh and no cameras", take->mesh_path || take->cameras_path ? "it" : "them", p->id);
-    take_close(take);
+            has.mesh[0] ? "cameras" : has.cameras[0] ? "mesh" : "mesh and no cameras", has.mesh[0] || has.cameras[0] ? "it" : "them", p->id);
     if (text[0])
         return 0;
     struct job *j = add_item(l, "", PRODUCT_OWED);
@@ -602,29 +596,28 @@ static int look_at_reconstruct(struct look *l, char text[PROCESSING_TEXT])
 static int look_at_solve(struct look *l, char text[PROCESSING_TEXT])
 {
     struct products *p = l->p;
-    struct take *take = NULL;
-    const int err = take_open(&take, p->dir);
+    char linear[PATH_BYTES];
+    struct pieces has;
+    const int err = pieces_find(&has, p->dir);
     if (err)
         return err;
-    if (!take->mesh_path || !take->cameras_path || !take->panorama_path || !take->n_views) {
-        say(text, "not started: missing are%s%s%s%s", take->mesh_path ? "" : " geometry/mesh.*", take->cameras_path ? "" : " geometry/cameras", take->panorama_path ? "" : " panorama.exr",
-            take->n_views ? "" : " linear/*.exr");
-        take_close(take);
+    if (!has.mesh[0] || !has.cameras[0] || !has.panorama[0] || !has.n_views) {
+        say(text, "not started: missing are%s%s%s%s", has.mesh[0] ? "" : " geometry/mesh.*", has.cameras[0] ? "" : " geometry/cameras", has.panorama[0] ? "" : " panorama.exr",
+            has.n_views ? "" : " linear/*.exr");
         return 0;
     }
     struct job *j = add_item(l, "", PRODUCT_OWED);
     snprintf(j->out, sizeof(j->out), "solve/%s/report.json", solve_name(l->step));
     struct key key = key_begin(solve_name(l->step));
     key_text(&key, p->site->config->process.options);
-    key_file(&key, "mesh", take->mesh_path);
-    key_file(&key, "cameras", take->cameras_path);
-    key_folder(&key, take->cameras_path);
-    key_file(&key, "panorama", take->panorama_path);
-    key_file(&key, "start", take->start_path);
-    for (int i = 0; i < take->n_views; i++)
-        key_file(&key, take->view_names[i], take->view_paths[i]);
+    key_file(&key, "mesh", has.mesh);
+    key_file(&key, "cameras", has.cameras);
+    key_folder(&key, has.cameras);
+    key_file(&key, "panorama", has.panorama);
+    key_file(&key, "start", has.start);
+    in_take(p, linear, "linear");
+    key_folder(&key, linear);
     key_end(&key, j->key);
-    take_close(take);
     const struct note *note = find_note(p, l->step, "");
     if (is_there(p, note, j->key)) {
         l->item[0].verdict = PRODUCT_THERE;
@@ -750,14 +743,10 @@ static int copy_calibrated(const struct products *p, char text[PROCESSING_TEXT])
 // What is missing in geometry/, as words; "": nothing.
 static int look_for_geometry(const struct products *p, const char **missing)
 {
-    struct take *take = NULL;
-    const int err = take_open(&take, p->dir);
-    *missing = "";
-    if (err)
-        return err;
-    *missing = take->mesh_path ? (take->cameras_path ? "" : "cameras") : take->cameras_path ? "mesh.*" : "mesh.* and cameras";
-    take_close(take);
-    return 0;
+    struct pieces has;
+    const int err = pieces_find(&has, p->dir);
+    *missing = err ? "" : has.mesh[0] ? (has.cameras[0] ? "" : "cameras") : has.cameras[0] ? "mesh.*" : "mesh.* and cameras";
+    return err;
 }
 
 // ---- making -------------------------------------------------------------------------------------------------------------------
@@ -997,11 +986,10 @@ int products_keep(struct products *p, enum processing_step step, int item, const
             err = -ENOENT;
         }
         if (!err) { // something of known size: the mesh
-            struct take *take = NULL;
-            err = take_open(&take, p->dir);
+            struct pieces has;
+            err = pieces_find(&has, p->dir);
             if (!err)
-                snprintf(made.file, sizeof(made.file), "geometry/%.50s", strrchr(take->mesh_path, '/') + 1);
-            take_close(take);
+                snprintf(made.file, sizeof(made.file), "geometry/%.50s", strrchr(has.mesh, '/') + 1);
         }
     } else {
         take_saying(&made, said, text);
