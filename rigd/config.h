@@ -41,16 +41,16 @@ struct trigger_config {      // [trigger]
     uint32_t max_hold_ms;    // no line stays pressed longer, whatever anyone asks; at most 10000
 };
 
-enum demosaic { DEMOSAIC_AHD, DEMOSAIC_BILINEAR, DEMOSAIC_HALF };
+enum develop_quality { DEVELOP_AHD, DEVELOP_BILINEAR, DEVELOP_HALF };
 enum solve_then { SOLVE_THEN_OFF, SOLVE_THEN_STANDARD, SOLVE_THEN_FINAL };
 
 // What happens once the frames are here. Without a [develop] section: nothing; without [solve]: no solve.
 struct process_config {
     // [develop]
     bool develop;             // after = on
-    enum demosaic demosaic;
-    char flat[256];           // folder of <camera>.exr, "": none
-    char colour[256];         // file of all bodies, or folder of <camera>.json; "": none
+    enum develop_quality demosaic;
+    char flat[256];           // frame of an even white, or folder of <camera>.exr; "": none
+    char colour[256];         // gains and scales of all bodies (rigctl calibrate colour), or folder of <camera>.json; "": none
     int develop_jobs;         // frames at a time; 0: one per core
     uint32_t memory_mb;       // of developing; 0: half of what the machine has
     uint32_t develop_timeout_s, panorama_timeout_s;

@@ -17,7 +17,6 @@
 #include <string.h>
 #include <strings.h>
 #include <sys/stat.h>
-#include <time.h>
 #include <unistd.h>
 
 #define FORMAT "studiorig processing 1"
@@ -54,7 +53,6 @@ struct products {
     int n_notes;
     struct job *job[PROCESSING_N_STEPS];
     int n_jobs[PROCESSING_N_STEPS];
-    struct timespec began[PROCESSING_N_STEPS];
 };
 
 // ---- small things -------------------------------------------------------------------------------------------------------------
@@ -447,8 +445,11 @@ static void look_at_develop(struct look *l)
         find_calibration(path, c->colour, k->name, ".json");
         key_file(&key, "colour", path);
         key_end(&key, j->key);
-        if (is_there(p, find_note(p, STEP_DEVELOP, k->name), j->key))
+        const struct note *note = find_note(p, STEP_DEVELOP, k->name);
+        if (is_there(p, note, j->key)) {
             item->verdict = PRODUCT_THERE;
+            say(item->text, "%s", note->text);
+        }
         in_take(p, path, raw->file);
         if (item->verdict == PRODUCT_OWED && access(path, R_OK)) {
             item->verdict = PRODUCT_MISSING;
@@ -552,8 +553,10 @@ static void look_at_panorama(struct look *l, char text[PROCESSING_TEXT])
     key_text(&key, from);
     key_file(&key, "panorama.exr", there);
     key_end(&key, j->key);
-    if (is_there(p, note, j->key))
+    if (is_there(p, note, j->key)) {
         l->item[0].verdict = PRODUCT_THERE;
+        say(l->item[0].text, "%s", note->text);
+    }
 }
 
 static int look_at_reconstruct(struct look *l, char text[PROCESSING_TEXT])
@@ -845,7 +848,6 @@ int products_begin(struct products *p, enum processing_step step, int item, stru
     if (item < 0 || item >= p->n_jobs[step])
         return -EINVAL;
     const struct job *j = &p->job[step][item];
-    clock_gettime(CLOCK_MONOTONIC, &p->began[step]);
     snprintf(out->dir, sizeof(out->dir), "%s", p->dir);
     if (step == STEP_RECONSTRUCT || is_solve(step)) {
         in_take(p, path, "log");
@@ -873,6 +875,10 @@ int products_begin(struct products *p, enum processing_step step, int item, stru
             char to[PATH_BYTES];
             in_take(p, to, j->out);
             err = link_file(path, to);
+            snprintf(path, sizeof(path), "%.700s/%s/panorama-report.json", p->site->takes_dir, j->from);
+            in_take(p, to, "panorama-report.json");
+            if (!err && !access(path, F_OK))
+                err = link_file(path, to);
             break;
         }
         add_program(p, out, "rigd-panorama");
@@ -950,32 +956,50 @@ static void take_saying(struct note *note, const char *said, char text[PROCESSIN
     if (json_parse(&v, said, strlen(said), NULL))
         return;
     json_get_number(v, "clipped_share", &note->clipped_share);
-    json_get_number(v, "seconds", &note->seconds);
-    if (!json_get_string(v, "warnings.0", &warning) || !json_get_string(v, "warning", &warning)) {
+    if (!json_get_string(v, "warnings.0", &warning)) {
         snprintf(note->text, sizeof(note->text), "%.190s", warning);
         say(text, "%s", note->text);
     }
     json_free(v);
 }
 
-int products_keep(struct products *p, enum processing_step step, int item, const char *said, char text[PROCESSING_TEXT])
+// What is doubtful about a panorama, from the report beside it: a clipped light, a missing stop.
+static void take_findings(const struct products *p, struct note *note, char text[PROCESSING_TEXT])
+{
+    char path[PATH_BYTES], key[40];
+    struct json *report = NULL;
+    in_take(p, path, "panorama-report.json");
+    if (access(path, F_OK) || json_read(&report, path))
+        return;
+    for (int i = 0; i < json_length(report, "findings") && !note->text[0]; i++) {
+        bool doubtful = false;
+        const char *stop = "", *what = "";
+        snprintf(key, sizeof(key), "findings.%d", i);
+        const struct json *f = json_get(report, key);
+        json_get_bool(f, "doubtful", &doubtful);
+        json_get_string(f, "stop", &stop);
+        if (!doubtful || json_get_string(f, "text", &what))
+            continue;
+        snprintf(note->text, sizeof(note->text), "not to be trusted: %.24s%s%.140s", stop, stop[0] ? ": " : "", what);
+        say(text, "%s", note->text);
+    }
+    json_free(report);
+}
+
+int products_keep(struct products *p, enum processing_step step, int item, const char *said, double seconds, char text[PROCESSING_TEXT])
 {
     char path[PATH_BYTES];
-    struct timespec now;
     const char *missing = "";
     text[0] = 0;
     if (item < 0 || item >= p->n_jobs[step])
         return -EINVAL;
     const struct job *j = &p->job[step][item];
-    struct note made = { .step = step, .state = NOTE_MADE, .rmse_held_out_percent = NAN };
+    struct note made = { .step = step, .state = NOTE_MADE, .seconds = seconds, .rmse_held_out_percent = NAN };
     if (step == STEP_DEVELOP)
         memcpy(made.item, j->name, sizeof(made.item));
     memcpy(made.key, j->key, sizeof(made.key));
     memcpy(made.from, j->from, sizeof(made.from));
     snprintf(made.file, sizeof(made.file), "%.63s", j->out);
-    clock_gettime(CLOCK_MONOTONIC, &now);
-    if (step != STEP_DEVELOP) // several at a time: each says its own
-        made.seconds = (double)(now.tv_sec - p->began[step].tv_sec) + 1e-9 * (double)(now.tv_nsec - p->began[step].tv_nsec);
     int err = 0;
     if (is_solve(step)) {
         err = keep_solve(p, step, &made, text);
@@ -991,6 +1015,8 @@ int products_keep(struct products *p, enum processing_step step, int item, const
             if (!err)
                 snprintf(made.file, sizeof(made.file), "geometry/%.50s", strrchr(has.mesh, '/') + 1);
         }
+    } else if (step == STEP_PANORAMA) {
+        take_findings(p, &made, text);
     } else {
         take_saying(&made, said, text);
     }
@@ -1017,8 +1043,9 @@ void products_complaint(const struct products *p, enum processing_step step, con
     char path[PATH_BYTES], tail[LOG_TAIL + 1], *line = NULL, *save = NULL;
     const char *log = step == STEP_RECONSTRUCT ? "reconstruct" : is_solve(step) ? solve_name(step) : NULL;
     if (!log) {
+        const char *cause = strstr(heard, "error: ");
         if (heard[0])
-            say(text, "%.200s", heard);
+            say(text, "%.200s", cause ? cause + 7 : heard);
         else
             say(text, "its program failed without a word (exit %d)", code);
         return;

@@ -38,8 +38,8 @@ int products_look(struct products *p, enum processing_step step, struct processi
 // Ready to make item: *out is what to start, or has n_words 0 - then it was file work, and is done. -errno: text says why not.
 int products_begin(struct products *p, enum processing_step step, int item, struct executor_command *out, char text[PROCESSING_TEXT]);
 
-// The process has ended well; said is its last line. Gives the product its final name and notes it. 0 (text: worth saying) or -errno (text: why not).
-int products_keep(struct products *p, enum processing_step step, int item, const char *said, char text[PROCESSING_TEXT]);
+// The process has ended well after so many seconds; said is its last line. Gives the product its final name and notes it. 0 (text: worth saying) or -errno (text: why not).
+int products_keep(struct products *p, enum processing_step step, int item, const char *said, double seconds, char text[PROCESSING_TEXT]);
 
 // Why a process that kept a log failed: its last words. said: what was heard.
 void products_complaint(const struct products *p, enum processing_step step, const char *heard, int code, char text[PROCESSING_TEXT]);

@@ -29,6 +29,7 @@ struct task {
     enum processing_step step;
     int item, code, err;
     unsigned mask;
+    double seconds;
     struct workshop_request request;
     struct products_facts facts;
     struct processing_item *items;
@@ -49,6 +50,7 @@ struct run { // by the executor's job number
     struct bench *bench;
     enum processing_step step;
     int item;
+    int64_t began_ns;
 };
 
 struct beginning { // started, but not yet a process
@@ -108,7 +110,7 @@ static void work(struct workshop *w, struct task *t)
         t->err = products_begin(b->products, t->step, t->item, &t->command, t->text);
         return;
     case TASK_KEEP:
-        t->err = products_keep(b->products, t->step, t->item, t->said, t->text);
+        t->err = products_keep(b->products, t->step, t->item, t->said, t->seconds, t->text);
         return;
     case TASK_COMPLAIN:
         products_complaint(b->products, t->step, t->said, t->code, t->text);
@@ -285,10 +287,11 @@ static int find_run(const struct workshop *w, const char *take, enum processing_
     return -1;
 }
 
-static void prepare_to_keep(struct workshop *w, struct bench *b, enum processing_step step, int item, const char *said)
+static void prepare_to_keep(struct workshop *w, struct bench *b, enum processing_step step, int item, const char *said, double seconds)
 {
     struct task *t = new_task(TASK_KEEP, b, step, item);
     snprintf(t->said, sizeof(t->said), "%s", said);
+    t->seconds = seconds;
     append(&w->prepared, t);
 }
 
@@ -313,12 +316,11 @@ static void on_ended(void *arg, int job, const struct executor_end *end)
 {
     struct workshop *w = arg;
     const struct run r = w->run[job];
-    const bool is_solve = r.step == STEP_PREVIEW || r.step == STEP_STANDARD || r.step == STEP_FINAL;
     w->run[job].used = false;
     if (end->signalled) {
         processing_ended(w->processing, now_ns(), r.bench->id, r.step, r.item, JOB_KILLED, strsignal(end->code));
-    } else if (end->code == 0 || (is_solve && end->code == 3)) { // 3: done, not to be trusted; the report says why
-        prepare_to_keep(w, r.bench, r.step, r.item, end->said);
+    } else if (end->code == 0 || (r.step != STEP_RECONSTRUCT && end->code == 3)) { // 3: done, not to be trusted; its report says why
+        prepare_to_keep(w, r.bench, r.step, r.item, end->said, 1e-9 * (double)(now_ns() - r.began_ns));
         processing_ended(w->processing, now_ns(), r.bench->id, r.step, r.item, JOB_DONE, NULL);
     } else {
         struct task *t = new_task(TASK_COMPLAIN, r.bench, r.step, r.item);
@@ -358,7 +360,7 @@ static void begun(struct workshop *w, struct task *t)
         return;
     }
     if (!t->command.n_words) { // file work, and done
-        prepare_to_keep(w, b, t->step, t->item, "");
+        prepare_to_keep(w, b, t->step, t->item, "", 0);
         processing_ended(w->processing, now_ns(), b->id, t->step, t->item, JOB_DONE, NULL);
         return;
     }
@@ -372,7 +374,7 @@ static void begun(struct workshop *w, struct task *t)
         processing_ended(w->processing, now_ns(), b->id, t->step, t->item, JOB_CANNOT_START, t->text);
         return;
     }
-    w->run[job] = (struct run){ .used = true, .bench = b, .step = t->step, .item = t->item };
+    w->run[job] = (struct run){ .used = true, .bench = b, .step = t->step, .item = t->item, .began_ns = now_ns() };
     if (mark.paused)
         executor_signal(w->executor, job, EXECUTOR_PAUSE);
 }
