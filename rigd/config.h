@@ -41,6 +41,32 @@ struct trigger_config {      // [trigger]
     uint32_t max_hold_ms;    // no line stays pressed longer, whatever anyone asks; at most 10000
 };
 
+enum develop_quality { DEVELOP_AHD, DEVELOP_BILINEAR, DEVELOP_HALF };
+enum solve_then { SOLVE_THEN_OFF, SOLVE_THEN_STANDARD, SOLVE_THEN_FINAL };
+
+// What happens once the frames are here. Without a [develop] section: nothing; without [solve]: no solve.
+struct process_config {
+    // [develop]
+    bool develop;             // after = on
+    enum develop_quality demosaic;
+    char flat[256];           // frame of an even white, or folder of <camera>.exr; "": none
+    char colour[256];         // gains and scales of all bodies (rigctl calibrate colour), or folder of <camera>.json; "": none
+    int develop_jobs;         // frames at a time; 0: one per core
+    uint32_t memory_mb;       // of developing; 0: half of what the machine has
+    uint32_t develop_timeout_s, panorama_timeout_s;
+    // [reconstruct]
+    char command[190];        // words; the take's path is added. "": none
+    char calibrated[256];     // a fixed rig's mesh.*, cameras and start.json; "": none
+    uint32_t reconstruct_timeout_s;
+    // [solve]
+    bool preview;
+    enum solve_then then;
+    char options[190];        // words for rigsolve solve
+    int solve_threads;        // 0: all cores
+    char solve_program[256];  // "": rigsolve beside rigd
+    uint32_t solve_timeout_s;
+};
+
 enum head_kind { HEAD_NONE, HEAD_MANUAL, HEAD_BOARD }; // the camera stays where it is | a person turns it | the trigger does
 
 struct config_stop { double yaw_deg, pitch_deg; }; // as trigger_head(): yaw to the left seen from above, pitch up
@@ -83,6 +109,7 @@ struct config {
     int calibration_shots;
     double lag_max_std_ms;
     struct trigger_config trigger;
+    struct process_config process;
     struct panorama_config panorama;
     int n_cameras;
     struct config_camera *camera; // in the file's order: the camera numbers of all of rigd

@@ -41,7 +41,8 @@ const char *take_state_name(enum take_state s)
 
 void ledger_init(struct ledger *l, const struct config *config)
 {
-    *l = (struct ledger){ .objects_per_shot = config->objects_per_shot, .spread_ns = -1, .sigma_ns = -1, .jitter_ns = -1 };
+    *l = (struct ledger){ .objects_per_shot = config->objects_per_shot, .spread_ns = -1, .sigma_ns = -1, .jitter_ns = -1,
+                          .processing = config->process.develop ? LEDGER_OWED : LEDGER_UNPROCESSED };
     l->camera = calloc((size_t)config->n_cameras + 1, sizeof(*l->camera));
     if (!l->camera)
         return;
@@ -59,7 +60,8 @@ void ledger_init(struct ledger *l, const struct config *config)
 
 void ledger_init_panorama(struct ledger *l, const struct config *config)
 {
-    *l = (struct ledger){ .kind = TAKE_PANORAMA, .objects_per_shot = 1, .spread_ns = -1, .sigma_ns = -1, .jitter_ns = -1 };
+    *l = (struct ledger){ .kind = TAKE_PANORAMA, .objects_per_shot = 1, .spread_ns = -1, .sigma_ns = -1, .jitter_ns = -1,
+                          .processing = config->process.develop ? LEDGER_OWED : LEDGER_UNPROCESSED };
     l->n_stops = config->panorama.n_stops;
     memcpy(l->stop, config->panorama.stop, sizeof(l->stop));
 }

@@ -246,7 +246,7 @@ static void settle(struct processing *p, int64_t now_ns, struct take *t, enum pr
 static void describe_item(char *out, size_t room, const struct item *i)
 {
     if (i->what.name[0])
-        snprintf(out, room, "camera %.24s%s%.48s%s: %s", i->what.name, i->what.slot[0] ? " (" : "", i->what.slot, i->what.slot[0] ? ")" : "", i->text);
+        snprintf(out, room, "camera %.24s%s%.48s%s: %.150s", i->what.name, i->what.slot[0] ? " (" : "", i->what.slot, i->what.slot[0] ? ")" : "", i->text);
     else
         snprintf(out, room, "%s", i->text);
 }
@@ -628,7 +628,7 @@ void processing_looked(struct processing *p, int64_t now_ns, const char *take, e
             copy(s->other, sizeof(s->other), items[0].name);
             snprintf(s->text, sizeof(s->text), "waits for the panorama of take %.95s", items[0].name);
         } else {
-            snprintf(why, sizeof(why), "the panorama of take %.95s is not there; rigctl process %.95s makes it", items[0].name, items[0].name);
+            snprintf(why, sizeof(why), "the panorama of take %.95s is not there; rigctl process of that take makes it", items[0].name);
             settle(p, now_ns, t, step, PROCESSING_MISSING, why);
         }
     } else {
@@ -722,9 +722,9 @@ void processing_recorded(struct processing *p, int64_t now_ns, const char *take,
 
 // ---- what is wanted -----------------------------------------------------------------------------------------------------------
 
-static bool is_wanted(const struct processing *p, const struct processing_take *what, enum processing_step step)
+static bool is_wanted(const struct processing *p, const struct take *t, const struct processing_take *what, enum processing_step step)
 {
-    if (what->is_panorama)
+    if (t->is_panorama)
         return step == STEP_PANORAMA;
     return ((p->settings.wanted | what->more) & BIT(step)) != 0;
 }
@@ -747,15 +747,16 @@ int processing_add(struct processing *p, int64_t now_ns, const struct processing
         for (int s = 0; s < PROCESSING_N_STEPS; s++)
             t->step[s].began_ns = t->step[s].ended_ns = INT64_MIN;
     }
-    if (t->settled)
+    if (t->settled) {
         t->added_ns = now_ns;
+        t->is_panorama = what->is_panorama;
+    }
     for (int s = 0; s < PROCESSING_N_STEPS; s++) {
         const enum processing_state state = t->step[s].state;
         const bool again = state == PROCESSING_FAILED || state == PROCESSING_MISSING || state == PROCESSING_CANCELLED;
-        if ((state == PROCESSING_OFF && is_wanted(p, what, s)) || (again && t->settled))
+        if ((state == PROCESSING_OFF && is_wanted(p, t, what, s)) || (again && t->settled))
             begin_anew(&t->step[s]);
     }
-    t->is_panorama = what->is_panorama;
     if (t->settled) {
         t->cancelled = t->settled = false;
         t->dirty = !what->is_owed;
