@@ -122,6 +122,20 @@ static bool flag_of(const struct json *v, const char *path)
     return b;
 }
 
+static void print_progress(const struct json *p)
+{
+    const char *step = text_of(p, "step"), *text = text_of(p, "text");
+    const double stop = number_of(p, "stop", 0), n_stops = number_of(p, "n_stops", 0);
+    if (!strcmp(step, "turn"))
+        fprintf(stderr, "  stop %.0f of %.0f: to yaw %g, pitch %g\n", stop, n_stops, number_of(p, "yaw_deg", 0), number_of(p, "pitch_deg", 0));
+    else if (!strcmp(step, "expose"))
+        fprintf(stderr, "  stop %.0f of %.0f: exposure %.0f, %s s\n", stop, n_stops, number_of(p, "frame", 0), text_of(p, "exposure"));
+    else if (!strcmp(step, "frame"))
+        fprintf(stderr, "    %s\n", text);
+    else
+        fprintf(stderr, "  stop %.0f of %.0f is done: %s\n", stop, n_stops, text);
+}
+
 static void print_event(const struct json *message)
 {
     const char *event = text_of(message, "event");
@@ -129,6 +143,10 @@ static void print_event(const struct json *message)
         fprintf(stderr, "  %s\n", text_of(message, "body.state"));
     else if (!strcmp(event, "say"))
         fprintf(stderr, "  %s: %s\n", text_of(message, "body.severity"), text_of(message, "body.text"));
+    else if (!strcmp(event, "panorama"))
+        print_progress(json_get(message, "body"));
+    else if (!strcmp(event, "prompt") && flag_of(message, "body.on"))
+        fprintf(stderr, "  ==> %s\n", text_of(message, "body.text"));
 }
 
 // Ask and wait for the answer. events: show what happens meanwhile. NULL: said why.
@@ -193,9 +211,12 @@ static void print_take(const struct json *t)
     printf("take %s: %s", text_of(t, "id"), text_of(t, "state"));
     if (json_get(t, "seconds"))
         printf(" after %.2f s", number_of(t, "seconds", 0));
-    printf("\n  %.0f of %.0f cameras, %.0f frames, %.1f MB", number_of(t, "n_delivered", 0), number_of(t, "n_expected", 0), number_of(t, "n_frames", 0),
+    const bool panorama = !strcmp(text_of(t, "kind"), "panorama");
+    if (panorama)
+        printf("\n  panorama of %.0f stops", number_of(t, "n_stops", 0));
+    printf("\n  %.0f of %.0f %s, %.0f frames, %.1f MB", number_of(t, "n_delivered", 0), number_of(t, "n_expected", 0), panorama ? "exposures" : "cameras", number_of(t, "n_frames", 0),
            1e-6 * number_of(t, "bytes", 0));
-    if (json_get(t, "seconds") && number_of(t, "seconds", 0) > 0)
+    if (!panorama && json_get(t, "seconds") && number_of(t, "seconds", 0) > 0)
         printf(", %.1f MB/s", 1e-6 * number_of(t, "bytes", 0) / number_of(t, "seconds", 1));
     putchar('\n');
     if (json_get(t, "spread_ms"))
@@ -217,6 +238,8 @@ static void print_status(const struct json *s)
            number_of(s, "n_cameras", 0), number_of(s, "n_quarantined", 0), text_of(s, "trigger"));
     if (text_of(s, "outcome")[0])
         printf("last: %s\n", text_of(s, "outcome"));
+    if (text_of(s, "prompt")[0])
+        printf("==> %s\n", text_of(s, "prompt"));
     printf("%-10s %-12s %-11s %-12s %-20s %5s %6s %8s  %s\n", "camera", "condition", "doing", "serial", "model", "batt", "free", "lag ms", "note");
     for (int i = 0; i < json_length(s, "cameras"); i++) {
         const struct json *c = element(s, "cameras", i);
