@@ -216,8 +216,8 @@ int exif_read(struct exif *out, int fd)
 double exif_true_time_s(double label_s, double apex_s)
 {
     // Rounding of labels reaches .093 stops (1/15, 1/30, 1/60, 15, 30); a third and a half lie .167 apart.
-    const double most_off = .1, apex_off = .02;
-    if (!(label_s > 0) || !isfinite(label_s))
+    const double most_off = .1, apex_off = .02, dial_end_s = 30.5;
+    if (!(label_s > 0) || label_s > dial_end_s)
         return label_s;
     const double stops = log2(label_s), third = round(3 * stops) / 3, half = round(2 * stops) / 2;
     if (apex_s > 0) {

@@ -209,7 +209,7 @@ int linear_open(struct linear *out, enum demosaic demosaic, const struct raw_fra
     const int shrink = demosaic == DEMOSAIC_HALF ? 2 : 1;
     *out = (struct linear){ .width = frame->width / shrink, .height = frame->height / shrink, .frame = frame, .interpolated = interpolated,
                             .saturation = saturation, .flat = flat, .gain = { gain[0], gain[1], gain[2] }, .demosaic = demosaic,
-                            .ring_y = { -1, -1, -1 } };
+                            .ring_y = { -2, -2, -2 } }; // -1 is a row: the one above the first
     bool ok = true;
     for (int i = 0; i < 3 && demosaic == DEMOSAIC_BILINEAR; i++) {
         out->ring[i] = malloc(((size_t)frame->width + 2) * sizeof(float));
