@@ -8,6 +8,7 @@
 #include <argp.h>
 #include <errno.h>
 #include <math.h>
+#include <poll.h>
 #include <stdarg.h>
 #include <stdio.h>
 #include <stdlib.h>
@@ -19,7 +20,7 @@
 enum { EXIT_DONE = 0, EXIT_FAILED = 1, EXIT_USAGE = 2, LINE_MAX_BYTES = 64 << 20 };
 
 struct arguments {
-    const char *socket_path, *name, *word[3];
+    const char *socket_path, *name, *merge, *output, *word[3];
     int n_words, shots;
     bool json, watch, without_missing;
     int (*without_daemon)(int argc, char **argv, bool json); // with the words from rest on
@@ -153,6 +154,23 @@ static void print_event(const struct json *message)
         fprintf(stderr, "  ==> %s\n", text_of(message, "body.text"));
 }
 
+// A person at this terminal was asked to do something: Enter says that it is done. Until then, or until the daemon says something.
+static bool wait_for_enter(const struct line_reader *r)
+{
+    struct pollfd p[] = { { .fd = 0, .events = POLLIN }, { .fd = r->fd, .events = POLLIN } };
+    char line[256];
+    if (r->n && memchr(r->bytes, '\n', r->n))
+        return false;
+    fputs("      Enter when done: ", stderr);
+    while (poll(p, 2, -1) < 0 && errno == EINTR)
+        ;
+    if (p[1].revents || !fgets(line, sizeof(line), stdin))
+        return false;
+    struct json *done = request_of("continue");
+    json_set_int(done, "id", 2);
+    return send_request(r->fd, done);
+}
+
 // Ask and wait for the answer. events: show what happens meanwhile. NULL: said why.
 static struct json *ask(const struct arguments *a, struct json *request, bool events)
 {
@@ -168,10 +186,17 @@ static struct json *ask(const struct arguments *a, struct json *request, bool ev
         send_request(r.fd, subscribe);
     }
     send_request(r.fd, request);
+    bool asked = false;
     for (struct json *m; !answer && (m = next_message(&r));) {
         int64_t id = -1;
-        if (json_get(m, "event"))
+        if (json_get(m, "event")) {
             print_event(m);
+            if (!strcmp(text_of(m, "event"), "prompt"))
+                asked = flag_of(m, "body.on") && isatty(0);
+            if (asked)
+                asked = !wait_for_enter(&r);
+        } else if (!json_get_int(m, "id", &id) && id == 2)
+            ;
         else if (!json_get_int(m, "id", &id) && id == 1)
             answer = m;
         else if (json_get(m, "error"))
@@ -355,9 +380,81 @@ static int take_result(const struct arguments *a, struct json *request)
 static int capture(const struct arguments *a)
 {
     struct json *r = request_of("capture");
-    json_set_string(r, "name", a->name);
+    json_set_string(r, "name", a->name ? a->name : "take");
     json_set_bool(r, "without_missing", a->without_missing);
     return take_result(a, r);
+}
+
+// The plan of a panorama: that file, a take's folder, or a take that the daemon knows.
+static bool find_plan(const struct arguments *a, char *out, size_t room)
+{
+    struct json *answer = NULL;
+    snprintf(out, room, "%s/panorama/panorama.json", a->merge);
+    if (!access(out, R_OK))
+        return true;
+    snprintf(out, room, "%s", a->merge);
+    if (!access(out, R_OK))
+        return true;
+    if (!strchr(a->merge, '/')) {
+        struct json *r = request_of("report");
+        json_set_string(r, "take", a->merge);
+        answer = ask(a, r, false);
+        if (answer)
+            snprintf(out, room, "%s/panorama/panorama.json", text_of(answer, "result.path"));
+        json_free(answer);
+        return answer && !access(out, R_OK);
+    }
+    return false;
+}
+
+// Offline: rigd-panorama, beside this program.
+static int merge(const struct arguments *a)
+{
+    char program[600], plan[1400];
+    if (!a->output) {
+        fputs("rigctl panorama --merge: expected -o FILE.exr\n", stderr);
+        return EXIT_USAGE;
+    }
+    if (!find_plan(a, plan, sizeof(plan))) {
+        log_error("--merge %s: found neither a panorama.json nor a panorama take", a->merge);
+        return EXIT_FAILED;
+    }
+    ssize_t n = readlink("/proc/self/exe", program, sizeof(program) - 20);
+    while (n > 0 && program[n - 1] != '/')
+        n--;
+    strcpy(program + (n > 0 ? n : 0), "rigd-panorama");
+    execl(program, "rigd-panorama", plan, "-o", a->output, a->json ? "--json" : NULL, NULL);
+    log_error("cannot start %s: %s", program, strerror(errno));
+    return EXIT_FAILED;
+}
+
+static int panorama(const struct arguments *a)
+{
+    struct json *r = request_of("panorama"), *answer;
+    if (a->merge) {
+        json_free(r);
+        return merge(a);
+    }
+    if (a->name)
+        json_set_string(r, "name", a->name);
+    answer = ask(a, r, !a->json); // shown in any case: a person may be asked for something
+    if (!answer)
+        return EXIT_FAILED;
+    const struct json *result = json_get(answer, "result");
+    char *text = a->json ? json_text(result) : NULL;
+    if (a->json)
+        puts(text ? text : "null");
+    else
+        print_take(result);
+    const bool good = !strcmp(text_of(result, "state"), "verified");
+    free(text);
+    json_free(answer);
+    return good ? EXIT_DONE : EXIT_FAILED;
+}
+
+static int go_on(const struct arguments *a)
+{
+    return ask_and_print(a, request_of("continue"), false, NULL, NULL);
 }
 
 static struct json *about_take(const char *what, const char *take)
@@ -514,6 +611,8 @@ static const struct {
     { "doctor", NULL, doctor, "what in this machine will fail before it fails" },
     { "preflight", NULL, preflight, "are all cameras fit for a take?" },
     { "capture", NULL, capture, "make a take; --name, --without-missing" },
+    { "panorama", NULL, panorama, "shoot the lights as an HDR panorama; --name; or --merge PLAN|TAKE -o FILE: without a daemon" },
+    { "continue", NULL, go_on, "what the panorama asked you to do is done" },
     { "cancel", NULL, cancel, "stop a take; after the shot its frames are fetched all the same" },
     { "takes", NULL, takes, "list takes" },
     { "report", "TAKE", report, "one take, camera by camera" },
@@ -532,7 +631,9 @@ static const struct argp_option option_list[] = {
     { "socket", 's', "PATH", 0, "rigd's socket (RIGD_SOCKET, else /run/rigd/rigd.sock)", 0 },
     { "json", 'j', NULL, 0, "print the answer as JSON", 0 },
     { "watch", 'w', NULL, 0, "status: live", 0 },
-    { "name", 'n', "NAME", 0, "capture: of the take", 0 },
+    { "name", 'n', "NAME", 0, "capture, panorama: of the take", 0 },
+    { "merge", 'M', "PLAN|TAKE", 0, "panorama: make FILE of one that was shot before", 0 },
+    { "output", 'o', "FILE", 0, "panorama --merge: the EXR", 0 },
     { "without-missing", 'm', NULL, 0, "capture: leave cameras out that are not fit", 0 },
     { "shots", 'k', "N", 0, "calibrate: how many (rigd.conf's)", 0 },
     { 0 },
@@ -553,6 +654,12 @@ static error_t parse(int key, char *arg, struct argp_state *state)
         return 0;
     case 'n':
         a->name = arg;
+        return 0;
+    case 'M':
+        a->merge = arg;
+        return 0;
+    case 'o':
+        a->output = arg;
         return 0;
     case 'm':
         a->without_missing = true;
@@ -606,7 +713,7 @@ static char *help(int key, const char *text, void *input)
 int main(int argc, char **argv)
 {
     static const struct argp argp = { option_list, parse, "COMMAND [TAKE|CAMERA|lag]", "Talks to rigd, the daemon of the rig.\v", NULL, help, NULL };
-    struct arguments a = { .name = "take" };
+    struct arguments a = { 0 };
     argp_err_exit_status = EXIT_USAGE;
     argp_program_version = "rigctl (studiorig) " STUDIORIG_VERSION;
     log_set_program("rigctl");
