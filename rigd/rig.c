@@ -221,6 +221,8 @@ int64_t rig_deadline_ns(const struct rig *r)
 void rig_trigger_is(struct rig *r, int64_t now, int abilities)
 {
     r->abilities = abilities;
+    if (abilities < 0)
+        rig_head_arrived(r, now, -EIO); // if one was asked to move
     rig_settle(r, now);
 }
 void rig_space(struct rig *r, int64_t now, int64_t free_bytes)
