@@ -196,11 +196,12 @@ static double shutter_s(const char *text)
 static double longest_shutter_s(const struct rig *r)
 {
     double longest = 0;
+    char label[16];
     for (int i = 0; i < r->n; i++)
         for (int k = 0; r->body[i].part && k < r->body[i].n_settings; k++)
             if (!strcmp(r->body[i].setting[k].name, "shutter"))
                 longest = fmax(longest, shutter_s(r->body[i].setting[k].found));
-    return longest;
+    return longest > 0 ? fmax(longest, ledger_exposure_label(longest, label)) : 0; // what is called 15 s lasts 16
 }
 
 // When the last exposure is over, or cannot last longer: where a flash-sync contact was seen, it says when its shutter opened.
