@@ -11,7 +11,7 @@ BUILD := build$(if $(filter-out release,$(VARIANT)),/$(VARIANT))
 MACHINE := $(shell uname -m)
 
 # ---- packages (Debian 12; the same names in Debian 13) ----------------------------------------------------------------
-PACKAGES := gcc make pkg-config libopenexr-dev libembree-dev libassimp-dev libjansson-dev libtiff-dev libpng-dev libjpeg-dev libexpat1-dev liblapacke-dev libopenblas-dev libcmocka-dev perl help2man \
+PACKAGES := gcc make pkg-config libopenexr-dev libembree-dev libassimp-dev libjansson-dev libtiff-dev libpng-dev libjpeg-dev libexpat1-dev liblapacke-dev libopenblas-dev libcmocka-dev perl help2man dcraw \
   libgphoto2-dev libgpiod-dev libinih-dev libraw-dev libsystemd-dev libumockdev-dev libxxhash-dev
 PACKAGES_FUZZ := clang libclang-rt-dev
 PACKAGES_BENCH := libceres-dev g++ gnuplot-nox
@@ -48,10 +48,10 @@ FUZZED := $(LIBRARY) $(RIG) $(RIGSIM_LIB) # what a fuzzer calls of these is link
 
 # ---- rules --------------------------------------------------------------------------------------------------------------
 object = $(patsubst %.c,$(BUILD)/obj/%.o,$(1))
-ifneq ($(filter test test-vm demo bench bench-rig chart figure5 figures stability experiments,$(MAKECMDGOALS)),)
+ifneq ($(filter test test-vm demo bench bench-develop bench-rig chart figure5 figures stability experiments,$(MAKECMDGOALS)),)
 FIRST := deps # these install what is missing before the first file is compiled
 endif
-.PHONY: all deps deps-fuzz deps-bench test test-vm demo bench bench-rig chart figure5 figures stability experiments fuzz check-includes man install clean help
+.PHONY: all deps deps-fuzz deps-bench test test-vm demo bench bench-develop bench-rig chart figure5 figures stability experiments fuzz check-includes man install clean help
 .DELETE_ON_ERROR:
 .SECONDARY:
 
@@ -114,6 +114,7 @@ $(BUILD)/tests/%: $(BUILD)/obj/tests/%.o $(BUILD)/librigsim.a $(BUILD)/librig.a 
 $(BUILD)/tests/test_camera_worker $(BUILD)/tests/test_config $(BUILD)/tests/test_rigsim_wire: | $(BUILD)/bin/rigd-camera $(BUILD)/bin/rigsim
 $(BUILD)/tests/test_develop: $(call object,rigd/develop.c)
 $(BUILD)/tests/test_develop: LIBS += $(LIBS_RAW)
+$(BUILD)/tests/test_rigd_panorama: | $(BUILD)/bin/rigd-panorama
 $(BUILD)/tests/bench/stability_joint: $(call object,solver/commands/arguments.c)
 $(BUILD)/obj/tests/test_usb_camera.o $(BUILD)/obj/tests/usb/usb_camera.o: CFLAGS_ALL += $(shell pkg-config --cflags umockdev-1.0 2>/dev/null)
 $(BUILD)/tests/test_usb_camera: LIBS += $(shell pkg-config --libs umockdev-1.0 2>/dev/null)
@@ -172,6 +173,8 @@ bench: deps $(BENCH_PROGRAMS) $(BUILD)/bin/rigsolve
 RIG_BENCHES ?= scale faults soak lag full eio kills
 bench-rig: deps all
 	@for b in $(RIG_BENCHES); do echo "== $$b"; BIN=$(BUILD)/bin perl tests/bench/rig.pl $$b || failed=1; done; [ -z "$$failed" ]
+bench-develop: deps all $(BUILD)/tests/bench/raws
+	@BIN=$(BUILD)/bin RAWS=$(BUILD)/tests/bench/raws sh tests/bench/develop.sh
 experiments: deps $(BUILD)/bin/rigsolve $(BUILD)/tests/bench/judge
 	@BIN=$(BUILD)/bin JUDGE=$(BUILD)/tests/bench/judge sh tests/bench/experiments.sh
 chart: deps deps-bench $(BUILD)/tests/bench/chart_lights
@@ -230,6 +233,7 @@ help:
 	@echo 'make test-vm    GPIO on a simulated chip, in a virtual machine'
 	@echo 'make bench      seconds and errors of kernels     make chart     speed against accuracy      make stability  where it fails'
 	@echo 'make bench-rig  the rig with simulated cameras: kills, faults, scale, soak, lag, disks (half an hour; RIG_BENCHES="lag soak")'
+	@echo 'make bench-develop  raws to radiance: seconds and MB per 24-megapixel frame, 85 of them sustained'
 	@echo 'make install    DESTDIR= PREFIX=/usr/local        make deps      Debian packages             make clean'
 	@echo 'variants: VARIANT=debug|asan|tsan; V=1 shows commands'
 -include $(shell find $(BUILD)/obj $(BUILD)/fuzz -name '*.d' 2>/dev/null)

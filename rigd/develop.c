@@ -237,7 +237,7 @@ static void read_exposure(struct raw_frame *f, const libraw_data_t *raw, const c
     f->has_subseconds = exif.has_subseconds;
     f->taken_ns = exif.taken_ns;
     struct tm tm;
-    if (!f->has_time && raw->other.timestamp > 0 && localtime_r(&raw->other.timestamp, &tm)) { // mktime's, of this host's zone
+    if (!f->has_time && raw->other.timestamp > 0 && raw->other.timestamp < 7000000000 && localtime_r(&raw->other.timestamp, &tm)) { // mktime's, of this host's zone
         f->has_time = true;
         f->taken_ns = (int64_t)timegm(&tm) * 1000000000;
     }

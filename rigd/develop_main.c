@@ -213,11 +213,12 @@ static void lap(struct job *j, const char *step)
     j->began = now;
 }
 
-static double peak_rss_bytes(void)
+static void say_resources(struct json *o)
 {
     struct rusage usage;
     getrusage(RUSAGE_SELF, &usage);
-    return (double)usage.ru_maxrss * 1024;
+    json_set_number(o, "cpu_s", (double)(usage.ru_utime.tv_sec + usage.ru_stime.tv_sec) + 1e-6 * (double)(usage.ru_utime.tv_usec + usage.ru_stime.tv_usec));
+    json_set_number(o, "peak_rss_bytes", (double)usage.ru_maxrss * 1024);
 }
 
 // ---- before anything large is read ---------------------------------------------------------------------------------------------
@@ -632,7 +633,7 @@ int main(int argc, char **argv)
     json_set_bool(j.result, "trusted", !err && !j.doubtful);
     json_set(j.result, "warnings", j.warnings);
     json_set(j.result, "seconds", j.seconds);
-    json_set_number(j.result, "peak_rss_bytes", peak_rss_bytes());
+    say_resources(j.result);
     char *text = json_text(j.result);
     puts(text ? text : "{\"ok\": false, \"error\": \"out of memory\"}");
     free(text);

@@ -289,7 +289,7 @@ static void judge_seam(struct job *j, const struct panorama_stop *stop, const st
 {
     if (r->n_cells < 20)
         return;
-    if (r->seam_ev > .25 || fabs(log2(r->seam_gain)) > .15)
+    if (r->seam_ev > .12 || fabs(log2(r->seam_gain)) > .15)
         find(j, DOUBT, "stop_does_not_fit", stop->name, NULL, "differs from the stops before it by %.2f EV (brightness %+.1f %%) where both see: "
              "stops in another order, other head angles than the plan's, or another lens", r->seam_ev, 100 * (r->seam_gain - 1));
     else if (fabs(r->seam_gain - 1) > .03)
@@ -354,6 +354,8 @@ static int do_stop(struct job *j, struct stitch *stitch, const struct panorama_s
         return 0;
     }
     err = bracket_finish(&merged, b, &n_clipped, &n_defects);
+    if (!err && merged.width == j->plan.lens.width_px && merged.height == j->plan.lens.height_px)
+        merged_unshade(&merged, &j->plan.lens);
     if (!err)
         err = stitch_add(stitch, &j->plan.lens, R, &merged, &seam);
     merged_free(&merged);

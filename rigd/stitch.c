@@ -79,8 +79,6 @@ struct taps {
 
 struct mosaic {
     const struct merged *m;
-    const struct lens *lens;
-    bool is_shaded;
     struct taps taps[2][2][3];
 };
 
@@ -125,11 +123,6 @@ static void interpolate(const struct mosaic *mo, int x, int y, struct pixel *out
         out->rgb[c] = n ? sum / (float)n : 0; // every colour is within reach but in a corner of the frame
         out->var[c] = n ? (c == RAW_GREEN ? 2.f : 4.f) * var / (float)n : 0;
         out->clip = n ? fmaxf(out->clip, clipped / (float)n) : 1;
-    }
-    if (mo->is_shaded) {
-        const float k = 1 / (float)lens_shading(mo->lens, (double[2]){ x + .5, y + .5 });
-        for (int c = 0; c < 3; c++)
-            out->rgb[c] *= k, out->var[c] *= k * k;
     }
 }
 
@@ -192,6 +185,8 @@ struct deposit {
 static void put(const struct deposit *d, int x, int y, double area)
 {
     struct stitch *s = d->s;
+    if (!(area > 0)) // a sliver of rounding
+        return;
     x = x < 0 ? x + s->width : x >= s->width ? x - s->width : x;
     y = y < 0 ? 0 : y >= s->height ? s->height - 1 : y;
     const size_t i = (size_t)y * (size_t)s->width + (size_t)x;
@@ -221,8 +216,7 @@ static void put_row(const struct deposit *d, struct polygon *p, int y, double un
     for (; x + 1 < hi; x++) {
         cut(p, true, x + 1, &left, &right);
         const double area = area_of(&left) * unit;
-        if (area != 0)
-            put(d, x, y, area);
+        put(d, x, y, area);
         *p = right;
     }
     put(d, x, y, area_of(p) * unit);
@@ -241,7 +235,7 @@ static double put_patch(const struct deposit *d, const struct corner *c[4], int 
         y_lo = fmin(y_lo, c[i]->y), y_hi = fmax(y_hi, c[i]->y);
     }
     const double steradians = 2 * M_PI / s->width, per_texel = s->width * (double)s->height / (4 * M_PI);
-    if (x_hi - x_lo > s->width / 64. && division < MOST_DIVISIONS) { // by a pole
+    if (x_hi - x_lo > s->width / 128. && division < MOST_DIVISIONS) { // by a pole
         struct corner grid[3][3];
         double sum = 0;
         for (int v = 0; v < 3; v++)
@@ -260,7 +254,7 @@ static double put_patch(const struct deposit *d, const struct corner *c[4], int 
                 sum += put_patch(d, (const struct corner *[4]){ &grid[v][u], &grid[v][u + 1], &grid[v + 1][u + 1], &grid[v + 1][u] }, division + 1);
         return sum;
     }
-    if (x_hi - x_lo > s->width / 64.) { // as small as it gets: all of it where it is
+    if (x_hi - x_lo > s->width / 128.) { // as small as it gets: all of it where it is
         double across[3], along[3], n[3], area = 0, middle[3];
         for (int k = 0; k < 3; k++) {
             across[k] = c[2]->dir[k] - c[0]->dir[k], along[k] = c[3]->dir[k] - c[1]->dir[k];
@@ -307,6 +301,7 @@ static double feather(const struct lens *l, double reach, double x, double y)
 
 struct view {
     const struct lens *lens;
+    double reach; // lens_reach_px()
     const double *R; // probe_from_camera
     struct corner *upper, *lower; // corners of a row of pixels, [width + 1]
 };
@@ -336,8 +331,12 @@ static void step_row(const struct stitch *s, struct view *v, int y)
     see_corners(s, v, v->lower, y + 1);
 }
 
-static bool patch_of(const struct view *v, int x, const struct corner *c[4])
+// Pixels whose colours would come from sites beyond the rim are left out.
+static bool patch_of(const struct view *v, int x, int y, const struct corner *c[4])
 {
+    const struct lens *l = v->lens;
+    if (hypot(x + .5 - l->centre_px[0], y + .5 - l->centre_px[1]) > v->reach - 2.2)
+        return false;
     c[0] = v->upper + x, c[1] = v->upper + x + 1, c[2] = v->lower + x + 1, c[3] = v->lower + x;
     return c[0]->is_seen && c[1]->is_seen && c[2]->is_seen && c[3]->is_seen;
 }
@@ -371,7 +370,7 @@ static int note_touched(struct stitch *s, struct view *v, const struct mosaic *m
             struct pixel p;
             const struct corner *c[4];
             interpolate(mo, x, y, &p);
-            if (p.clip > 0 && patch_of(v, x, c))
+            if (p.clip > 0 && patch_of(v, x, y, c))
                 put_patch(&d, c, 0);
         }
     }
@@ -424,24 +423,23 @@ int stitch_add(struct stitch *s, const struct lens *lens, const double R[9], con
                   lens->width_px, lens->height_px, m->width, m->height);
         return -EINVAL;
     }
-    struct mosaic mo = { .m = m, .lens = lens, .is_shaded = lens->v[0] != 0 || lens->v[1] != 0 || lens->v[2] != 0 };
+    struct mosaic mo = { .m = m };
     const size_t n_corners = (size_t)m->width + 1;
-    struct view v = { .lens = lens, .R = R, .upper = malloc(n_corners * sizeof(*v.upper)), .lower = malloc(n_corners * sizeof(*v.lower)) };
+    struct view v = { .lens = lens, .reach = lens_reach_px(lens), .R = R, .upper = malloc(n_corners * sizeof(*v.upper)), .lower = malloc(n_corners * sizeof(*v.lower)) };
     int err = v.upper && v.lower ? 0 : -ENOMEM;
     find_taps(&mo);
     if (!err)
         err = note_touched(s, &v, &mo);
-    const double reach = lens_reach_px(lens);
     struct pixel p;
     const struct deposit d = { .s = s, .pixel = &p };
     for (int y = 0; !err && y < m->height; y++) {
         step_row(s, &v, y);
         for (int x = 0; x < m->width; x++) {
             const struct corner *c[4];
-            if (!patch_of(&v, x, c))
+            if (!patch_of(&v, x, y, c))
                 continue;
             interpolate(&mo, x, y, &p);
-            p.feather = feather(lens, reach, x + .5, y + .5);
+            p.feather = feather(lens, v.reach, x + .5, y + .5);
             const double area = put_patch(&d, c, 0);
             r->solid_angle_sr += area;
             if (p.clip > 0)
@@ -480,7 +478,7 @@ int stitch_finish(struct image *out, struct stitch *s, const double M[9], struct
                 for (int c = 0; c < 3; c++)
                     t.num[c] += more->num[c], t.var[c] += more->var[c];
             }
-            if (!(t.weight > 0))
+            if (!(t.cover > 1e-5 * whole))
                 continue;
             float *to = out->data + i * N_CHANNELS;
             const double w = (double)t.weight;
