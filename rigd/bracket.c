@@ -107,6 +107,19 @@ void merged_free(struct merged *m)
     }
 }
 
+void merged_unshade(struct merged *m, const struct lens *lens)
+{
+    if (lens->v[0] == 0 && lens->v[1] == 0 && lens->v[2] == 0)
+        return;
+    for (int y = 0; y < m->height; y++)
+        for (int x = 0; x < m->width; x++) {
+            const size_t i = (size_t)y * (size_t)m->width + (size_t)x;
+            const float k = (float)(1 / fmax(lens_shading(lens, (double[2]){ x + .5, y + .5 }), .01)); // beyond the circle there is nothing
+            m->radiance[i] *= k;
+            m->variance[i] *= k * k;
+        }
+}
+
 // ---- does the frame belong? ---------------------------------------------------------------------------------------------------
 
 static bool differs(const char *a, const char *b)

@@ -111,4 +111,5 @@ int bracket_add(struct bracket *b, const struct raw_frame *f, double exposure_s,
 // Ends b, whatever comes of it. 0; -ENODATA: no frame was taken in.
 int bracket_finish(struct merged *out, struct bracket *b, int64_t *n_clipped, int64_t *n_defects);
 void bracket_free(struct bracket *b); // NULL allowed
+void merged_unshade(struct merged *m, const struct lens *lens); // what the lens' corners lost: of the same size
 void merged_free(struct merged *m);

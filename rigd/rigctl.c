@@ -1,6 +1,7 @@
 // rigd/rigctl.c - the daemon's command line client: one request, one answer, as a table or as JSON.
 //
 // CONTROL.md is the protocol. While a take runs, events of the stream are printed on a terminal, so that people see what happens.
+#include "rigd/rigctl_develop.h"
 #include "solver/take/json.h"
 #include "solver/take/log.h"
 
@@ -21,6 +22,9 @@ struct arguments {
     const char *socket_path, *name, *again, *word[3];
     int n_words, shots;
     bool json, watch, without_missing, cancel, open;
+    int (*without_daemon)(int argc, char **argv, bool json); // with the words from rest on
+    char **rest;
+    int n_rest;
 };
 
 struct line_reader {
@@ -683,6 +687,16 @@ static error_t parse(int key, char *arg, struct argp_state *state)
             argp_error(state, "--shots: found '%s', expected 3 to 1000", arg);
         return 0;
     case ARGP_KEY_ARG:
+        if (a->n_words == 0 && !strcmp(arg, "develop"))
+            a->without_daemon = rigctl_develop;
+        else if (a->n_words == 1 && !strcmp(a->word[0], "calibrate") && !strcmp(arg, "colour"))
+            a->without_daemon = rigctl_calibrate_colour;
+        if (a->without_daemon) { // options after these are their own
+            a->rest = state->argv + state->next - 1;
+            a->n_rest = state->argc - state->next + 1;
+            state->next = state->argc;
+            return 0;
+        }
         if (a->n_words == 2)
             argp_error(state, "found '%s', expected nothing more", arg);
         a->word[a->n_words++] = arg;
@@ -705,6 +719,9 @@ static char *help(int key, const char *text, void *input)
     fputs("Commands:\n", f);
     for (int i = 0; i < N_COMMANDS; i++)
         fprintf(f, "  %-9s %-7s %s\n", commands[i].name, commands[i].operand ? commands[i].operand : "", commands[i].what);
+    fputs("Without a daemon (--help after these tells more):\n"
+          "  develop   RAW...  raw files become linear EXRs\n"
+          "  calibrate colour  one radiometric space for all bodies, from frames of a grey card or chart\n", f);
     fputs("\nExit status: 0 done, 1 failed (a take: not verified), 2 usage.", f);
     fclose(f);
     return out;
@@ -718,7 +735,9 @@ int main(int argc, char **argv)
     argp_program_version = "rigctl (studiorig) " STUDIORIG_VERSION;
     log_set_program("rigctl");
     a.socket_path = getenv("RIGD_SOCKET") ? getenv("RIGD_SOCKET") : "/run/rigd/rigd.sock";
-    argp_parse(&argp, argc, argv, 0, NULL, &a);
+    argp_parse(&argp, argc, argv, ARGP_IN_ORDER, NULL, &a);
+    if (a.without_daemon)
+        return a.without_daemon(a.n_rest, a.rest, a.json);
     for (int i = 0; a.n_words && i < N_COMMANDS; i++) {
         if (strcmp(commands[i].name, a.word[0]))
             continue;
