@@ -82,7 +82,7 @@ static int measure_sharpness(double *out, const struct image *m)
     return 0;
 }
 
-int contact_measure(struct contact_figures *out, const struct image *m)
+int contact_measure(struct contact_figures *out, const struct image *m, bool full_is_one)
 {
     const int clip = image_channel(m, "clip");
     const size_t n = (size_t)m->width * (size_t)m->height;
@@ -97,7 +97,7 @@ int contact_measure(struct contact_figures *out, const struct image *m)
         const float *p = m->data + i * (size_t)m->n_channels;
         const double l = luminance(m, p);
         bool full = false;
-        for (int c = 0; clip < 0 && c < (m->n_channels < 3 ? 1 : 3); c++)
+        for (int c = 0; full_is_one && clip < 0 && c < (m->n_channels < 3 ? 1 : 3); c++)
             full |= p[c] >= .985f; // 253 of 255, the curve undone
         n_clipped += clip >= 0 ? p[clip] > .5f : full;
         if (!(l > 0))

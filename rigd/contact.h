@@ -10,7 +10,7 @@ enum { CONTACT_CELL_PX = 240, CONTACT_CELL_HEIGHT_PX = 160, CONTACT_NAME = 24 };
 
 struct contact_figures {
     double sharpness;     // NAN: too small or too flat to say
-    double clipped_share; // of pixels: "clip" > .5 where that channel is, else 8-bit full
+    double clipped_share; // of pixels
     double median, p99;   // of luminance, linear
 };
 
@@ -24,7 +24,8 @@ struct contact_entry {
     float (*cell)[3]; // [CONTACT_CELL_HEIGHT_PX][CONTACT_CELL_PX], linear
 };
 
-int contact_measure(struct contact_figures *out, const struct image *image); // 0, -ENOMEM, -EINVAL (no colour)
+// full_is_one: without a channel "clip" what reaches 1 is clipped (8-bit pictures). 0, -ENOMEM, -EINVAL (no pixels)
+int contact_measure(struct contact_figures *out, const struct image *image, bool full_is_one);
 int contact_cell(struct contact_entry *e, const struct image *image);        // box means, centred on black; allocates. 0 or -ENOMEM
 // Needs three cameras to compare; with fewer only what is clipped is said. developed: luminance is radiance, not the sensor's range.
 void contact_judge(struct contact_entry *e, int n, bool developed);

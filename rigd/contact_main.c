@@ -76,7 +76,7 @@ static int look_at(struct contact_entry *e, const char *dir, const char *file, b
     snprintf(e->name, sizeof(e->name), "%.*s", (int)(strrchr(file, '.') - file), file);
     int err = linear ? image_read(&image, path) : image_read_texture(&image, path, true);
     if (!err) {
-        err = contact_measure(&e->figures, &image);
+        err = contact_measure(&e->figures, &image, !linear);
         if (!err)
             err = contact_cell(e, &image);
         image_free(&image);
