@@ -93,7 +93,7 @@ $(BUILD)/bin/rigd-camera: $(call object,rigd/camera_gphoto.c rigd/camera_worker.
 	$(link_rig) $(LIBS_CAMERA) -o $@
 $(BUILD)/bin/rigd-contact: $(call object,rigd/contact.c rigd/contact_main.c) $(BUILD)/libtake.a
 	$(link_rig) $(LIBS) -o $@
-$(BUILD)/bin/rigd-unpack: $(call object,rigd/develop.c rigd/exif.c rigd/unpack.c) $(BUILD)/librig.a $(BUILD)/libtake.a
+$(BUILD)/bin/rigd-unpack: $(call object,rigd/develop.c rigd/unpack.c) $(BUILD)/librig.a $(BUILD)/libtake.a
 	$(link_rig) $(LIBS_RAW) -ljansson -o $@
 $(BUILD)/bin/rigd-develop: $(call object,rigd/develop.c rigd/develop_main.c) $(BUILD)/librig.a $(BUILD)/libtake.a
 	$(link_rig) $(LIBS_RAW) -lOpenEXRCore -ltiff -lpng -ljpeg -ljansson -lxxhash -o $@

@@ -120,7 +120,7 @@ static const struct key panorama_keys[] = {
     { "meter", SECONDS, FIELD(config, panorama.meter_s), 1e-5, 60, false },
     { "shortest", SECONDS, FIELD(config, panorama.shortest_s), 1e-5, 60, false },
     { "longest", SECONDS, FIELD(config, panorama.longest_s), 1e-5, 60, false },
-    { "frames_max", INTEGER, FIELD(config, panorama.frames_max), 2, 32, false },
+    { "frames_max", INTEGER, FIELD(config, panorama.frames_max), 2, CONFIG_FRAMES_MAX, false },
     { "settle_ms", UNSIGNED, FIELD(config, panorama.settle_ms), 0, 60000, false },
     { "neutral_density_ev", NUMBER, FIELD(config, panorama.neutral_density_ev), 0, 40, false },
 };
