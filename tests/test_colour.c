@@ -175,6 +175,28 @@ static void a_chart_in_perspective_gives_the_gains_and_its_own_colours(void **st
     colour_free(&fit.colour);
 }
 
+// The spread is measured where it was not fitted: with one frame per body a fit to everything would always say 0.
+static void a_card_that_two_bodies_see_differently_shows_in_the_spread(void **state)
+{
+    (void)state;
+    struct colour_frame frame[2] = { { .n_cells = 9, .serial = "1" }, { .n_cells = 9, .serial = "2" } };
+    struct colour_fit fit;
+    char why[200] = "";
+    for (int b = 0; b < 2; b++)
+        for (int k = 0; k < 9; k++)
+            for (int c = 0; c < 3; c++)
+                frame[b].cell[k].mean[c] = frame[b].cell[k].raw[c] = .3 * (b ? 1.1 : 1);
+    assert_int_equal(colour_fit(&fit, frame, 2, NULL, NULL, why, sizeof(why)), 0);
+    assert_true(fit.grey_spread < 1e-12);
+    assert_true(isnan(fit.chart_rms));
+    colour_free(&fit.colour);
+    for (int k = 1; k < 9; k += 2)
+        frame[1].cell[k].mean[RAW_BLUE] *= 1.03;
+    assert_int_equal(colour_fit(&fit, frame, 2, NULL, NULL, why, sizeof(why)), 0);
+    assert_true(fit.grey_spread > .029 && fit.grey_spread < .031);
+    colour_free(&fit.colour);
+}
+
 static void a_chart_that_is_clipped_or_dark_is_refused(void **state)
 {
     (void)state;
@@ -241,6 +263,7 @@ int main(void)
     const struct CMUnitTest tests[] = {
         cmocka_unit_test(the_charts_colours_are_the_published_ones),
         cmocka_unit_test(a_chart_in_perspective_gives_the_gains_and_its_own_colours),
+        cmocka_unit_test(a_card_that_two_bodies_see_differently_shows_in_the_spread),
         cmocka_unit_test(a_chart_that_is_clipped_or_dark_is_refused),
         cmocka_unit_test(corners_that_make_no_chart_are_refused),
         cmocka_unit_test(the_file_is_read_or_refused_by_what_is_wrong),
