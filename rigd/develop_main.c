@@ -574,10 +574,14 @@ static int measure(struct job *j)
     char why[WHY_BYTES] = "";
     struct cell cell[COLOUR_CELLS_MAX];
     const double share = j->a.columns == CHART_COLUMNS ? .5 : 1; // a chart has borders
-    int err = read_sites(j);
+    int err = choose_flat(j);
+    if (!err)
+        err = read_flat(j);
+    if (!err)
+        err = read_sites(j);
     if (err)
         return err;
-    err = colour_measure(cell, &j->frame, &j->saturation, j->scale, j->a.corner, j->a.columns, j->a.rows, share, why, sizeof(why));
+    err = colour_measure(cell, &j->frame, &j->saturation, j->flat, j->scale, j->a.corner, j->a.columns, j->a.rows, share, why, sizeof(why));
     if (err)
         return fail(j, err, "%s", why);
     struct json *list = json_new_array();

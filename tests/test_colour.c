@@ -114,7 +114,7 @@ static struct colour_frame measured(const char *serial, const double gain[3], do
     struct saturation s;
     char why[200] = "";
     assert_int_equal(saturation_of(&s, &f, f.saturation), 0);
-    assert_int_equal(colour_measure(out.cell, &f, &s, 1, corners, CHART_COLUMNS, CHART_ROWS, .5, why, sizeof(why)), 0);
+    assert_int_equal(colour_measure(out.cell, &f, &s, NULL, 1, corners, CHART_COLUMNS, CHART_ROWS, .5, why, sizeof(why)), 0);
     snprintf(out.serial, sizeof(out.serial), "%s", serial);
     memcpy(out.srgb_from_camera, srgb_from_camera, sizeof(srgb_from_camera));
     saturation_free(&s);
@@ -221,11 +221,11 @@ static void corners_that_make_no_chart_are_refused(void **state)
     const double outside[4][2] = { { -1, 0 }, { 100, 0 }, { 100, 100 }, { 0, 100 } }, crossed[4][2] = { { 0, 0 }, { 100, 100 }, { 100, 0 }, { 0, 100 } },
                  mirrored[4][2] = { { 100, 0 }, { 0, 0 }, { 0, 100 }, { 100, 100 } }, tiny[4][2] = { { 10, 10 }, { 30, 10 }, { 30, 25 }, { 10, 25 } }, nan[4][2] = { { NAN, 0 }, { 1, 0 }, { 1, 1 }, { 0, 1 } };
     assert_int_equal(saturation_of(&s, &f, f.saturation), 0);
-    assert_int_equal(colour_measure(cell, &f, &s, 1, outside, 6, 4, .5, why, sizeof(why)), -EINVAL);
-    assert_int_equal(colour_measure(cell, &f, &s, 1, crossed, 6, 4, .5, why, sizeof(why)), -EINVAL);
-    assert_int_equal(colour_measure(cell, &f, &s, 1, mirrored, 6, 4, .5, why, sizeof(why)), -EINVAL);
-    assert_int_equal(colour_measure(cell, &f, &s, 1, tiny, 6, 4, .5, why, sizeof(why)), -EINVAL);
-    assert_int_equal(colour_measure(cell, &f, &s, 1, nan, 6, 4, .5, why, sizeof(why)), -EINVAL);
+    assert_int_equal(colour_measure(cell, &f, &s, NULL, 1, outside, 6, 4, .5, why, sizeof(why)), -EINVAL);
+    assert_int_equal(colour_measure(cell, &f, &s, NULL, 1, crossed, 6, 4, .5, why, sizeof(why)), -EINVAL);
+    assert_int_equal(colour_measure(cell, &f, &s, NULL, 1, mirrored, 6, 4, .5, why, sizeof(why)), -EINVAL);
+    assert_int_equal(colour_measure(cell, &f, &s, NULL, 1, tiny, 6, 4, .5, why, sizeof(why)), -EINVAL);
+    assert_int_equal(colour_measure(cell, &f, &s, NULL, 1, nan, 6, 4, .5, why, sizeof(why)), -EINVAL);
     saturation_free(&s);
     raw_free(&f);
 }

@@ -586,6 +586,15 @@ static void the_flat_field_of_this_body_and_aperture_is_taken(void **state)
             for (int c = 0; c < 3; c++)
                 assert_true(fabs((double)im.data[(y * im.width + x) * 4 + c] / .4 - 1) < .01);
     image_free(&im);
+    for (int k = 0; k < 2; k++) { // a card in a corner and one in the middle are equally bright with it, not without
+        struct json *middle, *corner;
+        assert_int_equal(run(&middle, "$BIN/rigd-develop --patch 220,160,60,60 %s $D/a.dng", k ? "--flat $D/flat8.dng" : ""), 0);
+        assert_int_equal(run(&corner, "$BIN/rigd-develop --patch 20,20,60,60 %s $D/a.dng", k ? "--flat $D/flat8.dng" : ""), 0);
+        const double ratio = number(corner, "cells.4.mean.1") / number(middle, "cells.4.mean.1");
+        assert_true(k ? fabs(ratio - 1) < .005 : ratio < .85);
+        json_free(middle);
+        json_free(corner);
+    }
     assert_int_equal(run(NULL, "$BIN/rigd-develop --half --flat $D/flat11.dng $D/a.dng $D/b.exr >/dev/null 2>$D/said"), 1);
     assert_int_equal(run(NULL, "grep -q 'no flat field of body 10001.*f/8' $D/said && test ! -e $D/b.exr"), 0);
     scratch_empty();
