@@ -1,6 +1,7 @@
 // rigd/rigctl_develop.c - see rigctl_develop.h.
 #include "rigd/rigctl_develop.h"
 #include "rigd/colour.h"
+#include "rigd/develop_options.h"
 #include "solver/take/atomic_file.h"
 #include "solver/take/json.h"
 #include "solver/take/log.h"
@@ -213,6 +214,13 @@ static int parse_count(struct argp_state *state, const char *option, const char 
     return (int)n;
 }
 
+static void require_exposure(struct argp_state *state, const char *option, const char *text, bool zero_allowed)
+{
+    double v[3];
+    if (!option_exposure(text, v, zero_allowed))
+        argp_error(state, "%s: found '%s'; expected seconds, f-number and ISO such as 1/128,8,100", option, text);
+}
+
 static const char *base_name(const char *path)
 {
     const char *slash = strrchr(path, '/');
@@ -264,6 +272,7 @@ static void pass(struct argp_state *state, char *passed[PASSED_MAX], int *n_pass
 static error_t parse_develop(int key, char *text, struct argp_state *state)
 {
     struct develop_arguments *a = state->input;
+    double dn;
     switch (key) {
     case 'o':
         a->folder = text;
@@ -290,12 +299,16 @@ static error_t parse_develop(int key, char *text, struct argp_state *state)
         pass(state, a->passed, &a->n_passed, "--colour", text);
         return 0;
     case OPTION_REFERENCE:
+        require_exposure(state, "--reference-exposure", text, false);
         pass(state, a->passed, &a->n_passed, "--reference-exposure", text);
         return 0;
     case OPTION_EXPOSURE:
+        require_exposure(state, "--exposure", text, true);
         pass(state, a->passed, &a->n_passed, "--exposure", text);
         return 0;
     case OPTION_SATURATION:
+        if (!option_saturation(text, &dn))
+            argp_error(state, "--saturation: found '%s'; expected 1 to 65535", text);
         pass(state, a->passed, &a->n_passed, "--saturation", text);
         return 0;
     case OPTION_MODEL:
@@ -573,6 +586,7 @@ static void set_everywhere(struct argp_state *state, struct colour_arguments *a,
 static error_t parse_colour(int key, char *text, struct argp_state *state)
 {
     struct colour_arguments *a = state->input;
+    double corner[4][2];
     switch (key) {
     case 'o':
         a->out = text;
@@ -581,9 +595,13 @@ static error_t parse_colour(int key, char *text, struct argp_state *state)
         a->json = true;
         return 0;
     case OPTION_PATCH:
+        if (!option_patch(text, corner))
+            argp_error(state, "--patch: found '%s'; expected X,Y,W,H", text);
         set_everywhere(state, a, "--patch", text);
         return 0;
     case OPTION_CHART:
+        if (!option_chart(text, corner))
+            argp_error(state, "--chart: found '%s'; expected the x,y of four corners", text);
         set_everywhere(state, a, "--chart", text);
         return 0;
     case OPTION_PLACES:
@@ -599,6 +617,7 @@ static error_t parse_colour(int key, char *text, struct argp_state *state)
         pass(state, a->passed, &a->n_passed, "--flat", text);
         return 0;
     case OPTION_EXPOSURE:
+        require_exposure(state, "--exposure", text, true);
         pass(state, a->passed, &a->n_passed, "--exposure", text);
         return 0;
     case OPTION_JOBS:

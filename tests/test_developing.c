@@ -461,7 +461,11 @@ static void a_bad_frame_is_named_and_the_others_are_done(void **state)
     assert_int_equal(run(NULL, "grep -q b.dng $D/said && grep -q none.dng $D/said && test ! -e $D/out/b.exr -a -e $D/out/a.exr -a -e $D/out/c.exr"), 0);
     assert_int_equal(run(NULL, "mkdir $D/other; cp $D/a.dng $D/other; $BIN/rigctl develop -o $D/out $D/a.dng $D/other/a.dng 2>/dev/null"), 2);
     assert_int_equal(run(NULL, "$BIN/rigctl develop $D/a.dng 2>/dev/null"), 2);
-    assert_int_equal(run(NULL, "$BIN/rigctl develop -o $D/out --jobs 0 $D/a.dng 2>/dev/null"), 2);
+    static const char *const bad[] = { "develop -o $D/out --jobs 0", "develop -o $D/out --exposure 1/0,8,100", "develop -o $D/out --exposure 1,8", "develop -o $D/out --reference-exposure 0,8,100",
+                                       "develop -o $D/out --saturation 0", "develop -o $D/out --nonsense", "calibrate colour -o $D/c.json --patch 1,2,0,4", "calibrate colour -o $D/c.json --patch nan,2,3,4",
+                                       "calibrate colour -o $D/c.json --chart 1,2,3,4", "calibrate colour --patch 1,2,3,4", "calibrate colour -o $D/c.json" };
+    for (size_t i = 0; i < sizeof(bad) / sizeof(bad[0]); i++)
+        assert_int_equal(run(NULL, "$BIN/rigctl %s $D/a.dng 2>/dev/null", bad[i]), 2);
     assert_int_equal(run(NULL, "rm -r $D/out $D/other"), 0);
     scratch_empty();
 }
