@@ -48,7 +48,7 @@ FUZZED := $(LIBRARY) $(RIG) $(RIGSIM_LIB) # what a fuzzer calls of these is link
 
 # ---- rules --------------------------------------------------------------------------------------------------------------
 object = $(patsubst %.c,$(BUILD)/obj/%.o,$(1))
-ifneq ($(filter test test-vm demo bench bench-develop bench-rig chart figure5 figures stability experiments,$(MAKECMDGOALS)),)
+ifneq ($(filter test test-vm demo bench bench-develop bench-panorama bench-rig chart figure5 figures stability experiments,$(MAKECMDGOALS)),)
 FIRST := deps # these install what is missing before the first file is compiled
 endif
 .PHONY: all deps deps-fuzz deps-bench test test-vm demo bench bench-develop bench-rig chart figure5 figures stability experiments fuzz check-includes man install clean help
@@ -172,6 +172,9 @@ $(BUILD)/tests/bench/bench_kernels: LIBS += $(if $(HAVE_CERES),-lstdc++)
 $(BUILD)/tests/bench/bench_kernels: $(if $(HAVE_CERES),$(BUILD)/obj/tests/bench/ceres_peer.o)
 bench: deps $(BENCH_PROGRAMS) $(BUILD)/bin/rigsolve
 	@for b in $(BENCHES); do echo "== bench_$$b"; $(BUILD)/tests/bench/bench_$$b || exit 1; done
+PANORAMAS ?= $(wildcard ../shared/data/hdri/studio_small_03_1k.hdr) build/panorama/synth/panorama.exr
+bench-panorama: deps deps-bench $(BUILD)/tests/bench/bench_panorama $(BUILD)/bin/rigd-panorama $(BUILD)/bin/rigsolve
+	@BIN=$(BUILD)/bin BENCH=$(BUILD)/tests/bench/bench_panorama sh tests/bench/panorama.sh build/panorama $(PANORAMAS)
 RIG_BENCHES ?= scale faults soak lag full eio kills
 bench-rig: deps all
 	@for b in $(RIG_BENCHES); do echo "== $$b"; BIN=$(BUILD)/bin perl tests/bench/rig.pl $$b || failed=1; done; [ -z "$$failed" ]
@@ -243,6 +246,7 @@ help:
 	@echo 'make demo       a synthetic studio, end to end    make fuzz      libFuzzer on every parser (FUZZ_SECONDS=60)'
 	@echo 'make test-vm    GPIO on a simulated chip, in a virtual machine'
 	@echo 'make bench      seconds and errors of kernels     make chart     speed against accuracy      make stability  where it fails'
+	@echo 'make bench-panorama  what a merged panorama loses of the one that was photographed, and what 24 megapixels take'
 	@echo 'make bench-rig  the rig with simulated cameras: kills, faults, scale, soak, lag, disks (half an hour; RIG_BENCHES="lag soak")'
 	@echo 'make bench-develop  raws to radiance: seconds and MB per 24-megapixel frame, 85 of them sustained'
 	@echo 'make install    DESTDIR= PREFIX=/usr/local        make deps      Debian packages             make clean'
