@@ -112,6 +112,8 @@ $(BUILD)/tests/%: $(BUILD)/obj/tests/%.o $(BUILD)/librigsim.a $(BUILD)/librig.a 
 	@$(if $(V),,echo '  LD $@')
 	$(Q)$(CC) $(CFLAGS_ALL) -Wl,--as-needed $^ -lcmocka $(LIBS_RIG) $(LIBS) -o $@
 $(BUILD)/tests/test_camera_worker $(BUILD)/tests/test_config $(BUILD)/tests/test_rigsim_wire: | $(BUILD)/bin/rigd-camera $(BUILD)/bin/rigsim
+$(BUILD)/tests/test_developing: | $(BUILD)/bin/rigd-develop $(BUILD)/bin/rigctl
+$(BUILD)/tests/test_develop: | $(BUILD)/bin/rigd-unpack
 $(BUILD)/tests/test_develop: $(call object,rigd/develop.c)
 $(BUILD)/tests/test_develop: LIBS += $(LIBS_RAW)
 $(BUILD)/tests/test_rigd_panorama: | $(BUILD)/bin/rigd-panorama
@@ -195,11 +197,20 @@ stability: deps deps-bench $(BUILD)/tests/bench/stability_kernels $(BUILD)/tests
 
 # ---- installation ---------------------------------------------------------------------------------------------------------
 MAN := $(addprefix $(BUILD)/man/rigsolve,.1 $(addprefix -,$(addsuffix .1,$(filter-out arguments inputs output solve_materials solved,$(notdir $(COMMANDS:.c=))))))
-RIG_MAN := $(addprefix $(BUILD)/man/,rigctl.1 rigd.8)
+RIG_MAN := $(addprefix $(BUILD)/man/,rigctl.1 rigctl-develop.1 rigctl-calibrate-colour.1 rigd-develop.1 rigd.8)
 man: $(MAN) $(RIG_MAN)
 $(BUILD)/man/rigctl.1: $(BUILD)/bin/rigctl
 	@mkdir -p $(@D)
 	$(Q)help2man -N -n 'asks and tells the daemon of a photogrammetry rig' -o $@ $<
+$(BUILD)/man/rigctl-develop.1: $(BUILD)/bin/rigctl
+	@mkdir -p $(@D)
+	$(Q)help2man -N -n 'raw files become linear pictures' --version-string=$(VERSION) -o $@ "$< develop"
+$(BUILD)/man/rigctl-calibrate-colour.1: $(BUILD)/bin/rigctl
+	@mkdir -p $(@D)
+	$(Q)help2man -N -n 'one radiometric space for all bodies of a rig' --version-string=$(VERSION) -o $@ "$< calibrate colour"
+$(BUILD)/man/rigd-develop.1: $(BUILD)/bin/rigd-develop
+	@mkdir -p $(@D)
+	$(Q)help2man -N -n 'one raw file becomes one linear picture' -o $@ $<
 $(BUILD)/man/rigd.8: $(BUILD)/bin/rigd
 	@mkdir -p $(@D)
 	$(Q)help2man -N -s 8 -n 'fires the cameras of a photogrammetry studio and keeps every frame' -o $@ $<
@@ -212,7 +223,7 @@ $(BUILD)/man/rigsolve-%.1: $(BUILD)/bin/rigsolve
 install: all $(MAN) $(RIG_MAN)
 	install -D -m 755 -t $(DESTDIR)$(PREFIX)/bin $(addprefix $(BUILD)/bin/,rigsolve $(RIG_PROGRAMS))
 	install -D -m 644 -t $(DESTDIR)$(PREFIX)/share/man/man1 $(MAN)
-	install -D -m 644 -t $(DESTDIR)$(PREFIX)/share/man/man1 $(BUILD)/man/rigctl.1
+	install -D -m 644 -t $(DESTDIR)$(PREFIX)/share/man/man1 $(filter %.1,$(RIG_MAN))
 	install -D -m 644 -t $(DESTDIR)$(PREFIX)/share/man/man8 $(BUILD)/man/rigd.8
 	install -D -m 644 config/blender/import_studiorig.py $(DESTDIR)$(PREFIX)/share/studiorig/blender/import_studiorig.py
 	install -D -m 644 config/completion/rigsolve.bash $(DESTDIR)$(PREFIX)/share/bash-completion/completions/rigsolve

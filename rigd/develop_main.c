@@ -531,9 +531,17 @@ static int write_exr(struct job *j)
     return err ? fail(j, err, "%s was not written", j->a.out) : 0;
 }
 
+static bool is_same_file(const char *a, const char *b)
+{
+    struct stat one, other;
+    return !stat(a, &one) && !stat(b, &other) && one.st_dev == other.st_dev && one.st_ino == other.st_ino;
+}
+
 static int develop(struct job *j)
 {
     struct stat st;
+    if (is_same_file(j->a.raw, j->a.out) || (j->a.tiff && is_same_file(j->a.raw, j->tiff_path)))
+        return fail(j, -EINVAL, "its picture would take its place: choose another OUT");
     json_set_string(j->result, "out", j->a.out);
     json_set_string(j->result, "demosaic", demosaic_names[j->a.demosaic]);
     if (j->a.tiff)
@@ -543,8 +551,9 @@ static int develop(struct job *j)
         err = say_what_is_made(j);
     if (err)
         return err;
-    json_set_bool(j->result, "skipped", is_made(j));
-    if (is_made(j))
+    const bool skipped = is_made(j);
+    json_set_bool(j->result, "skipped", skipped);
+    if (skipped)
         return 0;
     lap(j, "hash");
     if (j->a.tiff)

@@ -904,6 +904,8 @@ void processing_record(const struct processing *p, const char *take, struct proc
         if (step->state == PROCESSING_CANCELLED && out->processing == LEDGER_SETTLED)
             out->processing = LEDGER_CANCELLED;
         char text[PROCESSING_TEXT];
+        if (s == STEP_SHEET && step->state == PROCESSING_DONE && t->step[STEP_FOCUS].state == PROCESSING_DONE)
+            continue; // the developed frames know better
         for (int i = 0; i < step->n_items; i++)
             if (step->item[i].text[0] && (step->item[i].state == ITEM_FAILED || step->item[i].state == ITEM_DONE)) {
                 describe_item(text, sizeof(text), &step->item[i]);

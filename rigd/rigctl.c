@@ -213,9 +213,9 @@ static struct json *ask(const struct arguments *a, struct json *request, bool ev
     for (struct json *m; !answer && (m = next_message(&r));) {
         int64_t id = -1;
         const char *about = text_of(m, "body.take"), *take = a->n_words > 1 ? a->word[1] : "";
-        if (json_get(m, "event") && about[0] && take[0] && strcmp(about, take))
+        if (json_get(m, "event") && about[0] && take[0] && strcmp(about, take)) {
             ; // another take's
-        else if (json_get(m, "event")) {
+        } else if (json_get(m, "event")) {
             print_event(m);
             if (!strcmp(text_of(m, "event"), "prompt"))
                 asked = flag_of(m, "body.on") && isatty(0);

@@ -135,7 +135,7 @@ static int run_crew(struct crew *c, const char *stage)
     struct worker worker[JOBS_MAX] = { 0 };
     struct pollfd at[JOBS_MAX];
     int next = 0, busy = 0;
-    int err = find_program(c);
+    int err = 0;
     c->answer = calloc((size_t)c->n_frames, sizeof(c->answer[0]));
     if (!err && !c->answer)
         err = -ENOMEM;
@@ -165,7 +165,7 @@ static int run_crew(struct crew *c, const char *stage)
             finish(c, &worker[i]);
         }
     progress_end();
-    if (err && err != -ENOENT)
+    if (err)
         log_error("develop: %s", strerror(-err));
     return err;
 }
@@ -377,42 +377,38 @@ static void value_text(const struct json *answer, const char *key, char text[80]
         snprintf(text, 80, "%.79s", text_of(answer, key));
 }
 
+static int by_value(const void *a, const void *b)
+{
+    return strcmp(a, b);
+}
+
 static void name_odd_ones(const struct develop_arguments *a, const struct crew *c, const char *key, const char *what, struct json *warnings)
 {
-    char common[80] = "", one[80], line[600];
-    int most = 0, n_ok = 0, n_odd = 0;
+    char (*value)[80] = calloc((size_t)a->n, sizeof(*value)), common[80] = "", one[80], line[600] = "", text[800];
+    int most = 0, n_ok = 0, n_odd = 0, run = 0;
     size_t n = 0;
-    for (int i = 0; i < a->n && most <= a->n / 2; i++) {
-        int same = 0;
-        if (!flag_of(c->answer[i], "ok"))
-            continue;
-        char candidate[80];
-        value_text(c->answer[i], key, candidate);
-        for (int k = 0; k < a->n; k++) {
-            if (!flag_of(c->answer[k], "ok"))
-                continue;
-            value_text(c->answer[k], key, one);
-            same += !strcmp(one, candidate);
-        }
-        if (same > most) {
-            most = same;
-            strcpy(common, candidate);
+    for (int i = 0; value && i < a->n; i++)
+        if (flag_of(c->answer[i], "ok"))
+            value_text(c->answer[i], key, value[n_ok++]);
+    if (value)
+        qsort(value, (size_t)n_ok, sizeof(*value), by_value);
+    for (int i = 0; i < n_ok; i++) {
+        run = i && !strcmp(value[i], value[i - 1]) ? run + 1 : 1;
+        if (run > most) {
+            most = run;
+            strcpy(common, value[i]);
         }
     }
-    line[0] = 0;
-    for (int i = 0; i < a->n; i++) {
-        if (!flag_of(c->answer[i], "ok"))
-            continue;
-        n_ok++;
+    free(value);
+    for (int i = 0; i < a->n && most < n_ok; i++) {
         value_text(c->answer[i], key, one);
-        if (!strcmp(one, common))
+        if (!flag_of(c->answer[i], "ok") || !strcmp(one, common))
             continue;
         if (n_odd++ < 8 && n < sizeof(line))
             n += (size_t)snprintf(line + n, sizeof(line) - n, "%s%s has %s", n_odd > 1 ? ", " : "", base_name(a->raw[i]), one[0] ? one : "none");
     }
     if (!n_odd)
         return;
-    char text[800];
     snprintf(text, sizeof(text), "%s differs: %d of %d have %s, but %s%s", what, most, n_ok, common[0] ? common : "none", line, n_odd > 8 ? ", ..." : "");
     log_warning("develop: %s", text);
     json_append_string(warnings, text);
@@ -531,7 +527,7 @@ int rigctl_develop(int argc, char **argv, bool json)
     if (status)
         goto done;
     struct crew crew = { .n_frames = a.n, .n_jobs = a.n_jobs, .arguments = develop_command, .arg = &a };
-    status = run_crew(&crew, "develop") ? EXIT_FAILED : report_frames(&a, &crew, seconds_since(&began));
+    status = find_program(&crew) || run_crew(&crew, "develop") ? EXIT_FAILED : report_frames(&a, &crew, seconds_since(&began));
     free_answers(&crew);
 done:
     for (int i = 0; a.out && i < a.n; i++)
@@ -830,7 +826,7 @@ int rigctl_calibrate_colour(int argc, char **argv, bool json)
     if (find_places(&a))
         goto done;
     struct crew crew = { .n_frames = a.n, .n_jobs = a.n_jobs, .arguments = measure_command, .arg = &a };
-    if (!run_crew(&crew, "measure"))
+    if (!find_program(&crew) && !run_crew(&crew, "measure"))
         status = fit_frames(&a, &crew);
     free_answers(&crew);
 done:

@@ -466,6 +466,62 @@ static void a_bad_frame_is_named_and_the_others_are_done(void **state)
     scratch_empty();
 }
 
+static void a_decoder_that_dies_costs_one_frame_and_is_named(void **state)
+{
+    (void)state;
+    static const char program[] = "#!/bin/sh\n"
+                                  "for word; do last=$word; done\n"
+                                  "case $last in */b.exr) kill -SEGV $$ ;; */c.exr) exit 5 ;; esac\n"
+                                  "exec $REAL/rigd-develop \"$@\"\n";
+    const struct raw_dng_info info = raw_info(96, 64);
+    struct json *o;
+    raw_write(scratch_path("a.dng"), &info, raw_scatter, NULL);
+    raw_write(scratch_path("b.dng"), &info, raw_scatter, NULL);
+    raw_write(scratch_path("c.dng"), &info, raw_scatter, NULL);
+    assert_int_equal(run(NULL, "mkdir $D/bin && cp $BIN/rigctl $D/bin"), 0);
+    scratch_write("bin/rigd-develop", program, sizeof(program) - 1);
+    assert_int_equal(run(&o, "chmod +x $D/bin/rigd-develop; REAL=$(cd $BIN && pwd) $D/bin/rigctl develop --half --json -o $D/out $D/?.dng 2>$D/said"), 1);
+    assert_int_equal((int)number(o, "n_developed"), 1);
+    assert_non_null(strstr(text(o, "frames.1.error"), "died: Segmentation fault"));
+    assert_non_null(strstr(text(o, "frames.2.error"), "status 5"));
+    json_free(o);
+    assert_int_equal(run(NULL, "grep -q 'b.dng.*died' $D/said && test -e $D/out/a.exr"), 0);
+    assert_int_equal(run(NULL, "rm -r $D/bin $D/out"), 0);
+    scratch_empty();
+}
+
+static uint16_t grey(void *arg, int x, int y)
+{
+    (void)arg;
+    return (uint16_t)(4000 + (x * 31 + y * 17) % 64);
+}
+
+static void a_worker_takes_less_memory_than_two_frames(void **state)
+{
+    (void)state;
+#if defined(__SANITIZE_ADDRESS__)
+    return; // which takes its own
+#endif
+    const struct raw_dng_info info = raw_info(4000, 3000);
+    struct json *o;
+    raw_write(scratch_path("a.dng"), &info, grey, NULL);
+    assert_int_equal(run(&o, "$BIN/rigd-develop --ahd $D/a.dng $D/a.exr"), 0);
+    assert_true(number(o, "peak_rss_bytes") < 2. * 4000 * 3000 * 6);
+    json_free(o);
+    scratch_empty();
+}
+
+static void the_raw_is_never_overwritten(void **state)
+{
+    (void)state;
+    const struct raw_dng_info info = raw_info(96, 64);
+    raw_write(scratch_path("a.exr"), &info, raw_scatter, NULL);
+    assert_int_equal(run(NULL, "cp $D/a.exr $D/b; ln $D/a.exr $D/c.tif; $BIN/rigctl develop --half -o $D $D/a.exr >/dev/null 2>&1"), 1);
+    assert_int_equal(run(NULL, "$BIN/rigd-develop --half --tiff $D/a.exr $D/c.exr >/dev/null 2>&1"), 1);
+    assert_int_equal(run(NULL, "cmp -s $D/a.exr $D/b"), 0);
+    scratch_empty();
+}
+
 static void a_body_with_other_settings_is_named(void **state)
 {
     (void)state;
@@ -635,6 +691,9 @@ int main(void)
         cmocka_unit_test(a_second_run_makes_what_has_changed_and_nothing_else),
         cmocka_unit_test(a_kill_at_any_time_leaves_whole_files_or_none),
         cmocka_unit_test(a_bad_frame_is_named_and_the_others_are_done),
+        cmocka_unit_test(a_decoder_that_dies_costs_one_frame_and_is_named),
+        cmocka_unit_test(a_worker_takes_less_memory_than_two_frames),
+        cmocka_unit_test(the_raw_is_never_overwritten),
         cmocka_unit_test(a_body_with_other_settings_is_named),
         cmocka_unit_test(the_flat_field_of_this_body_and_aperture_is_taken),
         cmocka_unit_test(bodies_with_gains_of_their_own_share_one_space_after_calibration),

@@ -24,7 +24,7 @@ check() { # name, command...
         tail -10 "$D/rigd.log" 2>/dev/null | sed 's/^/#   /'
     fi
 }
-port=$((20000 + $$ % 2000 * 20))
+port=$((10000 + $$ % 1100 * 20))
 # Lights for the camera: a synthetic studio's, so that nothing outside this folder is needed.
 "$BIN/rigsolve" synth D1 -o "$D/studio" --size 16x16 >"$D/out" 2>&1 || { echo "1..0 # rigsolve synth: $(tail -1 "$D/out")"; exit 1; }
 cat >"$D/faults" <<E
