@@ -23,7 +23,7 @@ static double uniform(void)
     return (double)(dice >> 8) / (1 << 24);
 }
 
-// Tiles of random brightness that cover a part of the picture, seen by a lens that blurs with sigma_px, with noise.
+// Tiles of random brightness that cover a part of the picture, seen by a lens that blurs with sigma_px, with the noise of few photons.
 static void see(struct image *m, int tile_px, double covered, double sigma_px, double noise, double gain)
 {
     double *sharp = calloc(W * H, sizeof(double)), *rows = calloc(W * H, sizeof(double)), tile[W * H];
@@ -49,7 +49,7 @@ static void see(struct image *m, int tile_px, double covered, double sigma_px, d
                     rows[y * W + x] = sum / weight;
                 else
                     for (int c = 0; c < 3; c++)
-                        m->data[(y * W + x) * 3 + c] = (float)(gain * (sum / weight + noise * (uniform() + uniform() + uniform() - 1.5)));
+                        m->data[(y * W + x) * 3 + c] = (float)(gain * (sum / weight + noise * sqrt(sum / weight) * (uniform() + uniform() + uniform() - 1.5)));
             }
     free(sharp);
     free(rows);
