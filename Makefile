@@ -233,6 +233,7 @@ install: all $(MAN) $(RIG_MAN)
 	install -D -m 644 config/completion/rigctl.bash $(DESTDIR)$(PREFIX)/share/bash-completion/completions/rigctl
 	install -D -m 644 -t $(DESTDIR)$(PREFIX)/share/studiorig/config config/*.conf
 	install -D -m 644 -t $(DESTDIR)$(PREFIX)/share/studiorig/config/cameras config/cameras/*.conf
+	install -D -m 755 -t $(DESTDIR)$(PREFIX)/share/studiorig/config/reconstruct config/reconstruct/*
 	install -D -m 644 config/systemd/rigd.service $(DESTDIR)$(PREFIX)/lib/systemd/system/rigd.service
 	sed -i 's|/usr/local/bin|$(PREFIX)/bin|' $(DESTDIR)$(PREFIX)/lib/systemd/system/rigd.service
 	install -D -m 644 config/systemd/71-rigd.rules $(DESTDIR)$(PREFIX)/lib/udev/rules.d/71-rigd.rules
