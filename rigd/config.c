@@ -3,6 +3,7 @@
 // inih cuts long lines and section names without a word and does not tell line numbers to its handler; the reader below feeds it
 // line by line from memory, so that both are known here.
 #include "rigd/config.h"
+#include "rigd/access.h"
 #include "solver/take/atomic_file.h"
 #include "solver/take/log.h"
 
@@ -16,7 +17,7 @@
 
 enum { LINE_MAX_BYTES = 196, SECTION_MAX_BYTES = 48, FINDINGS_MAX = 20, LINES_MAX = 4096 };
 
-enum type { TEXT, PATH, INTEGER, UNSIGNED, NUMBER, BOOL, LINE, PORT, POWER, KIND, NAME };
+enum type { TEXT, PATH, INTEGER, UNSIGNED, NUMBER, BOOL, LINE, PORT, POWER, KIND, NAME, LISTEN };
 
 struct key {
     const char *name;
@@ -66,6 +67,10 @@ static const struct key trigger_keys[] = {
     { "hold_ms", UNSIGNED, FIELD(trigger_config, hold_ms), 1, 10000, false },
     { "max_hold_ms", UNSIGNED, FIELD(trigger_config, max_hold_ms), 1, 10000, false },
 };
+static const struct key web_keys[] = {
+    { "listen", LISTEN, FIELD(web_config, listen), 0, 0, true },
+    { "token_always", BOOL, FIELD(web_config, token_always), 0, 0, false },
+};
 static const struct key camera_keys[] = {
     { "serial", NAME, FIELD(config_camera, serial), 0, 0, false },
     { "port", PORT, FIELD(config_camera, port), 0, 0, true },
@@ -80,7 +85,7 @@ static const struct key camera_keys[] = {
 };
 #define COUNT(keys) ((int)(sizeof(keys) / sizeof((keys)[0])))
 
-enum section { NO_SECTION, RIG, SETTINGS, CALIBRATION, TRIGGER, CAMERA, BAD_SECTION };
+enum section { NO_SECTION, RIG, SETTINGS, CALIBRATION, TRIGGER, WEB, CAMERA, BAD_SECTION };
 static const struct {
     const char *name;
     const struct key *keys;
@@ -91,6 +96,7 @@ static const struct {
     [SETTINGS] = { "settings", NULL, 0 },
     [CALIBRATION] = { "calibration", calibration_keys, COUNT(calibration_keys) },
     [TRIGGER] = { "trigger", trigger_keys, COUNT(trigger_keys) },
+    [WEB] = { "web", web_keys, COUNT(web_keys) },
     [CAMERA] = { "camera", camera_keys, COUNT(camera_keys) },
 };
 
@@ -199,7 +205,7 @@ static void begin_section(struct reader *r, const char *name)
             r->seen_sections |= 1u << s;
             return;
         }
-    complain(r, r->line, "found section [%s], expected [rig], [settings], [trigger], [calibration] or [camera \"NAME\"]", name);
+    complain(r, r->line, "found section [%s], expected [rig], [settings], [trigger], [calibration], [web] or [camera \"NAME\"]", name);
     r->section = BAD_SECTION;
 }
 
@@ -369,6 +375,16 @@ static const char *set_value(const struct key *key, void *target, const char *va
                 return NULL;
             }
         return "software, gpio, usb or simulated";
+    case LISTEN: {
+        struct listen_address address;
+        if (!strcmp(value, "off"))
+            field[0] = 0;
+        else if (strlen(value) < key->room && !listen_parse(&address, value))
+            memcpy(field, value, strlen(value) + 1);
+        else
+            return "ADDRESS:PORT (127.0.0.1:8420, [::1]:8420; 0.0.0.0:8420 for all addresses), or off";
+        return NULL;
+    }
     case BOOL: {
         const bool yes = !strcmp(value, "yes") || !strcmp(value, "true");
         if (!yes && strcmp(value, "no") && strcmp(value, "false"))
@@ -456,7 +472,7 @@ static int take_line(void *arg, const char *section, const char *name, const cha
         const struct key *key = &sections[r->section].keys[k];
         if (strcmp(key->name, name))
             continue;
-        void *target = r->section == CAMERA ? (void *)&c->camera[c->n_cameras - 1] : r->section == TRIGGER ? (void *)&c->trigger : (void *)c;
+        void *target = r->section == CAMERA ? (void *)&c->camera[c->n_cameras - 1] : r->section == TRIGGER ? (void *)&c->trigger : r->section == WEB ? (void *)&c->web : (void *)c;
         if (r->seen >> k & 1)
             complain(r, r->line, "'%s' is there twice in this section; remove one", name);
         r->seen |= 1u << k;

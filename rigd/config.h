@@ -40,6 +40,11 @@ struct trigger_config {      // [trigger]
     uint32_t max_hold_ms;    // no line stays pressed longer, whatever anyone asks; at most 10000
 };
 
+struct web_config {          // [web], rigd/web.h
+    char listen[64];         // "127.0.0.1:8420", "[::1]:8420"; port 0: any free one; "": no page
+    bool token_always;       // on a loopback address, too; others want it anyway
+};
+
 struct config {
     // [rig]
     char name[64];
@@ -61,6 +66,7 @@ struct config {
     int calibration_shots;
     double lag_max_std_ms;
     struct trigger_config trigger;
+    struct web_config web;
     int n_cameras;
     struct config_camera *camera; // in the file's order: the camera numbers of all of rigd
 };
