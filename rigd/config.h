@@ -5,8 +5,9 @@
 // and a line that the INI reader would cut (200 characters; section names 49).
 #pragma once
 #include "rigd/camera.h"
+#include "rigd/lens.h"
 
-enum { CONFIG_CAMERAS_MAX = 256, CONFIG_NONE = -1 };
+enum { CONFIG_CAMERAS_MAX = 256, CONFIG_NONE = -1, CONFIG_STOPS_MAX = 64 };
 
 struct config_camera {       // [camera "A01"]
     char name[24];           // letters, digits, - and _: it names files
@@ -45,6 +46,27 @@ struct web_config {          // [web], rigd/web.h
     bool token_always;       // on a loopback address, too; others want it anyway
 };
 
+enum head_kind { HEAD_NONE, HEAD_MANUAL, HEAD_BOARD }; // the camera stays where it is | a person turns it | the trigger does
+
+struct config_stop { double yaw_deg, pitch_deg; }; // as trigger_head(): yaw to the left seen from above, pitch up
+
+struct panorama_config {     // [panorama]
+    int camera;              // its number; it takes no part in ordinary takes. CONFIG_NONE: there is no [panorama]
+    char camera_name[24];
+    enum head_kind head;
+    struct lens lens;
+    double max_angle_deg;
+    double nodal_offset_m;   // entrance pupil in front of the point about which the head turns
+    double overlap;          // of neighbouring stops, where they are planned and not listed
+    int n_stops;
+    struct config_stop stop[CONFIG_STOPS_MAX];
+    double meter_s;          // first exposure of each stop; labels as on the dial, as in setting.shutter
+    double shortest_s, longest_s; // no exposure beyond
+    int frames_max;          // per stop
+    uint32_t settle_ms;      // from the head's rest to the first exposure
+    double neutral_density_ev; // of a filter in front of the lens
+};
+
 struct config {
     // [rig]
     char name[64];
@@ -67,6 +89,7 @@ struct config {
     double lag_max_std_ms;
     struct trigger_config trigger;
     struct web_config web;
+    struct panorama_config panorama;
     int n_cameras;
     struct config_camera *camera; // in the file's order: the camera numbers of all of rigd
 };

@@ -424,7 +424,8 @@ static void on_broken(void *arg, int err)
     heard.n_broken++;
 }
 
-static const struct trigger_host host = { on_fired, on_feedback, on_button, on_press_camera, on_broken, &heard };
+static const struct trigger_host host = { .fired = on_fired, .feedback = on_feedback, .button = on_button, .press_camera = on_press_camera,
+    .broken = on_broken, .arg = &heard };
 
 static struct trigger_lines *open_fake(int n)
 {
