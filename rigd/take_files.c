@@ -129,8 +129,8 @@ struct json *take_files_list(const char *take_dir)
             const char *name = solves[k]->d_name;
             if (!is_plain(name, strlen(name)))
                 continue;
-            snprintf(path, sizeof(path), "%.*s%s%s", (int)(star - known[i].path), known[i].path, name, star + 1);
-            add(list, take_dir, known[i].what, path);
+            if (snprintf(path, sizeof(path), "%.*s%s%s", (int)(star - known[i].path), known[i].path, name, star + 1) < (int)sizeof(path))
+                add(list, take_dir, known[i].what, path);
         }
     }
     for (int i = 0; i < n; i++)

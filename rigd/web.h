@@ -11,7 +11,7 @@
 #pragma once
 #include "rigd/config.h"
 
-enum { WEB_STREAMS_MAX = 32, WEB_ASKING_MAX = 16, WEB_CONNECTIONS_MAX = 128, WEB_REQUEST_MAX_MS = 15000 };
+enum { WEB_STREAMS_MAX = 32, WEB_ASKING_MAX = 16, WEB_CONNECTIONS_MAX = 192, WEB_REQUEST_MAX_MS = 15000 };
 
 struct web;
 
