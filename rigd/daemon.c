@@ -577,7 +577,9 @@ static void take_is_done(struct daemon *d)
     json_set_number(report, "seconds", seconds);
     log_info("take %s: %s after %.2f s%s%s", l->id, take_state_name(l->state), seconds, l->reason[0] ? ": " : "", l->reason);
     control_reply(d->control, d->resuming ? d->resume_token : d->take_token, report);
-    control_publish(d->control, "take", describe_take(l, false));
+    struct json *ended = describe_take(l, false);
+    json_set_number(ended, "seconds", seconds);
+    control_publish(d->control, "take", ended);
     if (d->resuming) {
         next_unfinished(d);
         return;

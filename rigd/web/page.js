@@ -66,6 +66,10 @@ async function press(request, done) {
     askTakes();
 }
 
+function showEnd(take) {
+    showOutcome("take " + take.id + ": " + take.state + (take.reason ? ": " + take.reason : "") + (take.seconds ? " after " + take.seconds.toFixed(1) + " s" : ""), take.state === "failed");
+}
+
 async function capture(event) {
     event.preventDefault();
     if ($("capture").disabled) return;
@@ -73,7 +77,7 @@ async function capture(event) {
     showButtons();
     const request = { do: "capture", name: $("name").value.trim() || "take" };
     if ($("leave-out").checked) request.without_missing = true;
-    await press(request, take => showOutcome("take " + take.id + ": " + take.state + (take.reason ? ": " + take.reason : "") + (take.seconds ? " after " + take.seconds.toFixed(1) + " s" : ""), take.state === "failed"));
+    await press(request, showEnd);
     pressed = false;
     showButtons();
 }
@@ -156,10 +160,7 @@ function showRig(data) {
     showNow();
     showButtons();
     if (!before || before.busy !== rig.busy || before.state !== rig.state) showPictures();
-    if (before && before.busy && !rig.busy) {
-        if (rig.outcome && !pressed) showOutcome(rig.outcome, true); // somebody else pressed
-        askTakes();
-    }
+    if (before && before.busy && !rig.busy) askTakes();
 }
 
 function facts(c) {
@@ -272,6 +273,8 @@ function showConnection(is) {
     $("connection").dataset.known = "yes";
     $("connection").className = is ? "" : "lost";
     setText($("connection"), is ? "connected" : "connection lost, trying again");
+    document.body.classList.toggle("stale", !is);
+    if (!is && $("count").textContent) setText($("count"), "as they were when the connection was lost");
     showButtons();
 }
 
@@ -308,7 +311,10 @@ function take(message) {
     case "lost": // this page was too slow: from the beginning
         connect();
         return;
-    default: // a take has changed
+    case "take":
+        if (!pressed) showEnd(message.body); // somebody else's
+        // and the list has changed: fall through
+    default:
         clearTimeout(takesDue);
         takesDue = setTimeout(askTakes, 200);
     }
