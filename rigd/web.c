@@ -63,6 +63,7 @@ struct visitor {
     struct visitor *next;
     int fd;
     enum doing doing;
+    bool leaves; // it was shut down; the library has not noticed yet
     int64_t since_ms;
 };
 
@@ -74,7 +75,7 @@ struct web {
     char token[ACCESS_TOKEN_LENGTH + 1], cookie[20], address[100];
     pthread_mutex_t lock; // of what follows
     struct visitor *visitors;
-    int n_visitors, n_streams, n_asking;
+    int n_staying, n_streams, n_asking;
 };
 
 static int64_t now_ms(void)
@@ -96,6 +97,13 @@ static void set_doing(struct web *w, struct MHD_Connection *connection, enum doi
     pthread_mutex_unlock(&w->lock);
 }
 
+static void send_away(struct web *w, struct visitor *v)
+{
+    shutdown(v->fd, SHUT_RDWR);
+    v->leaves = true;
+    w->n_staying--;
+}
+
 // Somebody comes: those who have had their time leave, and in a crowd the one who has asked nothing for longest. The library closes
 // a descriptor only after its visitor is forgotten, so what is shut down here is never another's.
 static void make_room(struct web *w)
@@ -103,14 +111,16 @@ static void make_room(struct web *w)
     const int64_t now = now_ms();
     struct visitor *idlest = NULL;
     for (struct visitor *v = w->visitors; v; v = v->next) {
+        if (v->leaves)
+            continue;
         const int64_t spent_ms = now - v->since_ms;
         if ((v->doing == WAITING && spent_ms > WEB_REQUEST_MAX_MS) || (v->doing == SENDING && spent_ms > FILE_MAX_MS))
-            shutdown(v->fd, SHUT_RDWR);
-        if (v->doing == WAITING && (!idlest || v->since_ms <= idlest->since_ms)) // the list begins with the youngest
+            send_away(w, v);
+        else if (v->doing == WAITING && (!idlest || v->since_ms <= idlest->since_ms)) // the list begins with the youngest
             idlest = v;
     }
-    if (idlest && w->n_visitors > CROWDED)
-        shutdown(idlest->fd, SHUT_RDWR);
+    if (idlest && w->n_staying >= CROWDED)
+        send_away(w, idlest);
 }
 
 static void on_connection(void *arg, struct MHD_Connection *connection, void **context, enum MHD_ConnectionNotificationCode code)
@@ -121,17 +131,17 @@ static void on_connection(void *arg, struct MHD_Connection *connection, void **c
         struct visitor *v = calloc(1, sizeof(*v));
         make_room(w);
         if (v) {
-            *v = (struct visitor){ w->visitors, MHD_get_connection_info(connection, MHD_CONNECTION_INFO_CONNECTION_FD)->connect_fd, WAITING, now_ms() };
+            *v = (struct visitor){ w->visitors, MHD_get_connection_info(connection, MHD_CONNECTION_INFO_CONNECTION_FD)->connect_fd, WAITING, false, now_ms() };
             w->visitors = v;
-            w->n_visitors++;
+            w->n_staying++;
         }
         *context = v;
     } else if (*context) {
         struct visitor **at = &w->visitors;
+        w->n_staying -= !((struct visitor *)*context)->leaves;
         while (*at != *context)
             at = &(*at)->next;
         *at = (*at)->next;
-        w->n_visitors--;
         free(*context);
         *context = NULL;
     }
