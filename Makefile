@@ -35,11 +35,12 @@ endif
 TAKE := $(wildcard solver/take/*.c)
 LIBRARY := $(TAKE) $(filter-out solver/main.c,$(wildcard solver/*.c)) $(wildcard solver/kernels/*.c)
 COMMANDS := $(wildcard solver/commands/*.c)
-RIG_PROGRAMS := rigctl rigd rigd-camera rigd-unpack
-RIG := $(filter-out $(addprefix rigd/,camera_gphoto.c camera_worker.c daemon.c develop.c main.c rigctl.c unpack.c),$(wildcard rigd/*.c))
+RIG_PROGRAMS := rigctl rigd rigd-camera rigd-contact rigd-unpack
+RIG := $(filter-out $(addprefix rigd/,camera_gphoto.c camera_worker.c contact_main.c daemon.c develop.c develop_main.c main.c rigctl.c unpack.c),$(wildcard rigd/*.c))
 RIGSIM := $(wildcard tests/rigsim/*.c)
-RIGSIM_LIB := $(filter-out $(addprefix tests/rigsim/,client.c main.c server.c server_faults.c server_shutter.c),$(RIGSIM))
+RIGSIM_LIB := $(filter-out $(addprefix tests/rigsim/,client.c main.c server.c server_faults.c server_head.c server_shutter.c),$(RIGSIM))
 LIBS_RIG = -ljansson -linih -lsystemd -lxxhash -lgpiod -lmicrohttpd -lm
+LIBS_RAW = -lraw_r -lgomp -lm
 LIBS_CAMERA = -lgphoto2 -lgphoto2_port -ljansson -lxxhash -lm
 TESTS := $(basename $(notdir $(wildcard tests/test_*.c))) check_kernels
 FUZZERS := $(patsubst fuzz_%,%,$(basename $(notdir $(wildcard tests/fuzz/fuzz_*.c))))
@@ -91,9 +92,11 @@ $(BUILD)/bin/rigctl: $(call object,rigd/rigctl.c) $(BUILD)/librig.a $(BUILD)/lib
 	$(link_rig) $(LIBS_RIG) -o $@
 $(BUILD)/bin/rigd-camera: $(call object,rigd/camera_gphoto.c rigd/camera_worker.c) $(BUILD)/librig.a $(BUILD)/libtake.a
 	$(link_rig) $(LIBS_CAMERA) -o $@
-$(BUILD)/bin/rigd-unpack: $(call object,rigd/develop.c rigd/unpack.c)
-	$(link_rig) -lraw_r -o $@
-$(BUILD)/bin/rigsim: $(call object,$(filter-out %/client.c,$(RIGSIM))) $(BUILD)/libstudiorig.a
+$(BUILD)/bin/rigd-contact: $(call object,rigd/contact.c rigd/contact_main.c) $(BUILD)/libtake.a
+	$(link_rig) $(LIBS) -o $@
+$(BUILD)/bin/rigd-unpack: $(call object,rigd/develop.c rigd/exif.c rigd/unpack.c) $(BUILD)/librig.a $(BUILD)/libtake.a
+	$(link_rig) $(LIBS_RAW) -ljansson -o $@
+$(BUILD)/bin/rigsim: $(call object,$(filter-out %/client.c,$(RIGSIM))) $(BUILD)/librig.a $(BUILD)/libstudiorig.a
 	@mkdir -p $(@D)
 	@$(if $(V),,echo '  LD $@')
 	$(Q)$(CC) $(CFLAGS_ALL) $^ $(LIBS) -o $@

@@ -18,7 +18,7 @@
 
 enum { LINE_MAX_BYTES = 196, SECTION_MAX_BYTES = 48, FINDINGS_MAX = 20, LINES_MAX = 4096 };
 
-enum type { TEXT, PATH, INTEGER, UNSIGNED, NUMBER, BOOL, LINE, PORT, POWER, KIND, NAME, HEAD, MODEL, SECONDS, NUMBERS, STOPS, LISTEN };
+enum type { TEXT, PATH, INTEGER, UNSIGNED, NUMBER, BOOL, LINE, PORT, POWER, KIND, NAME, HEAD, MODEL, SECONDS, NUMBERS, STOPS, ON_OFF, DEMOSAIC, THEN, LISTEN };
 
 struct key {
     const char *name;
@@ -72,6 +72,29 @@ static const struct key web_keys[] = {
     { "listen", LISTEN, FIELD(config, web.listen), 0, 0, true },
     { "token_always", BOOL, FIELD(config, web.token_always), 0, 0, false },
 };
+static const struct key develop_keys[] = {
+    { "after", ON_OFF, FIELD(process_config, develop), 0, 0, false },
+    { "demosaic", DEMOSAIC, FIELD(process_config, demosaic), 0, 0, false },
+    { "flat", PATH, FIELD(process_config, flat), 0, 0, false },
+    { "colour", PATH, FIELD(process_config, colour), 0, 0, false },
+    { "jobs", INTEGER, FIELD(process_config, develop_jobs), 0, 256, false },
+    { "memory_mb", UNSIGNED, FIELD(process_config, memory_mb), 0, 1e7, false },
+    { "timeout_s", UNSIGNED, FIELD(process_config, develop_timeout_s), 1, 86400, false },
+    { "panorama_timeout_s", UNSIGNED, FIELD(process_config, panorama_timeout_s), 1, 86400, false },
+};
+static const struct key reconstruct_keys[] = {
+    { "command", TEXT, FIELD(process_config, command), 0, 0, false },
+    { "calibrated", PATH, FIELD(process_config, calibrated), 0, 0, false },
+    { "timeout_s", UNSIGNED, FIELD(process_config, reconstruct_timeout_s), 1, 604800, false },
+};
+static const struct key solve_keys[] = {
+    { "preview", ON_OFF, FIELD(process_config, preview), 0, 0, false },
+    { "then", THEN, FIELD(process_config, then), 0, 0, false },
+    { "options", TEXT, FIELD(process_config, options), 0, 0, false },
+    { "threads", INTEGER, FIELD(process_config, solve_threads), 0, 256, false },
+    { "program", PATH, FIELD(process_config, solve_program), 0, 0, false },
+    { "timeout_s", UNSIGNED, FIELD(process_config, solve_timeout_s), 1, 604800, false },
+};
 static const struct key camera_keys[] = {
     { "serial", NAME, FIELD(config_camera, serial), 0, 0, false },
     { "port", PORT, FIELD(config_camera, port), 0, 0, true },
@@ -109,7 +132,7 @@ static const struct key panorama_keys[] = {
 _Static_assert(offsetof(struct lens, p) == offsetof(struct lens, k) + sizeof(((struct lens *)0)->k), "distortion is read as one list");
 #define COUNT(keys) ((int)(sizeof(keys) / sizeof((keys)[0])))
 
-enum section { NO_SECTION, RIG, SETTINGS, CALIBRATION, TRIGGER, PANORAMA, WEB, CAMERA, BAD_SECTION };
+enum section { NO_SECTION, RIG, SETTINGS, CALIBRATION, TRIGGER, PANORAMA, DEVELOP, RECONSTRUCT, SOLVE, WEB, CAMERA, BAD_SECTION };
 static const struct {
     const char *name;
     const struct key *keys;
@@ -120,6 +143,9 @@ static const struct {
     [SETTINGS] = { "settings", NULL, 0 },
     [CALIBRATION] = { "calibration", calibration_keys, COUNT(calibration_keys) },
     [TRIGGER] = { "trigger", trigger_keys, COUNT(trigger_keys) },
+    [DEVELOP] = { "develop", develop_keys, COUNT(develop_keys) },
+    [RECONSTRUCT] = { "reconstruct", reconstruct_keys, COUNT(reconstruct_keys) },
+    [SOLVE] = { "solve", solve_keys, COUNT(solve_keys) },
     [PANORAMA] = { "panorama", panorama_keys, COUNT(panorama_keys) },
     [WEB] = { "web", web_keys, COUNT(web_keys) },
     [CAMERA] = { "camera", camera_keys, COUNT(camera_keys) },
@@ -226,6 +252,12 @@ static void begin_section(struct reader *r, const char *name)
             r->section = s;
             if (s == TRIGGER)
                 r->trigger_line = r->hold_line = r->line;
+            if (s == DEVELOP) // naming it is asking for it
+                r->config->process.develop = true;
+            if (s == SOLVE) {
+                r->config->process.preview = true;
+                r->config->process.then = SOLVE_THEN_STANDARD;
+            }
             if (s == PANORAMA)
                 r->panorama_line = r->line;
             if (r->seen_sections >> s & 1)
@@ -233,7 +265,7 @@ static void begin_section(struct reader *r, const char *name)
             r->seen_sections |= 1u << s;
             return;
         }
-    complain(r, r->line, "found section [%s], expected [rig], [settings], [trigger], [calibration], [panorama], [web] or [camera \"NAME\"]", name);
+    complain(r, r->line, "found section [%s], expected [rig], [settings], [trigger], [calibration], [panorama], [develop], [reconstruct], [solve], [web] or [camera \"NAME\"]", name);
     r->section = BAD_SECTION;
 }
 
@@ -420,6 +452,7 @@ static int to_stops(const char *text, struct config_stop *out)
 static const char *set_value(const struct key *key, void *target, const char *value) // NULL, or what was expected
 {
     static const char *const kinds[] = { "software", "gpio", "usb", "simulated" };
+    static const char *const demosaics[] = { "ahd", "bilinear", "half" }, *const thens[] = { "off", "standard", "final" };
     static const char *const heads[] = { "none", "manual", "board" };
     static _Thread_local char range[80];
     char *field = (char *)target + key->offset;
@@ -477,6 +510,21 @@ static const char *set_value(const struct key *key, void *target, const char *va
         memcpy(field, &yes, sizeof(yes));
         return NULL;
     }
+    case ON_OFF: {
+        const bool on = !strcmp(value, "on");
+        if (!on && strcmp(value, "off"))
+            return "on or off";
+        memcpy(field, &on, sizeof(on));
+        return NULL;
+    }
+    case DEMOSAIC:
+    case THEN:
+        for (int i = 0; i < 3; i++)
+            if (!strcmp(value, key->type == THEN ? thens[i] : demosaics[i])) {
+                memcpy(field, &(int){ i }, sizeof(int)); // an enum's size
+                return NULL;
+            }
+        return key->type == THEN ? "off, standard or final" : "ahd, bilinear or half";
     case LINE:
         if (!strcmp(value, "none")) {
             const int none = CONFIG_NONE;
@@ -596,7 +644,8 @@ static int take_line(void *arg, const char *section, const char *name, const cha
         const struct key *key = &sections[r->section].keys[k];
         if (strcmp(key->name, name))
             continue;
-        void *target = r->section == CAMERA ? (void *)&c->camera[c->n_cameras - 1] : r->section == TRIGGER ? (void *)&c->trigger : (void *)c;
+        void *target = r->section == CAMERA ? (void *)&c->camera[c->n_cameras - 1] : r->section == TRIGGER ? (void *)&c->trigger
+                       : r->section >= DEVELOP ? (void *)&c->process : (void *)c;
         if (r->seen >> k & 1)
             complain(r, r->line, "'%s' is there twice in this section; remove one", name);
         r->seen |= 1u << k;
@@ -679,7 +728,7 @@ static void check_lines(struct reader *r)
         use_line(r, uses, &n, k->feedback_line, k->name, "feedback_line", r->camera_line[i]);
         use_line(r, uses, &n, k->relay_line, k->name, "relay_line", r->camera_line[i]);
         half |= t->kind != TRIGGER_SOFTWARE && k->half_line != CONFIG_NONE;
-        if (t->kind == TRIGGER_GPIO && k->full_line == CONFIG_NONE && t->full_line == CONFIG_NONE && i != c->panorama.camera)
+        if (t->kind == TRIGGER_GPIO && k->full_line == CONFIG_NONE && t->full_line == CONFIG_NONE && i != config_panorama_camera(c))
             complain(r, r->camera_line[i], "camera \"%s\" has no full_line and [trigger] has none for all; nothing would press it", k->name);
     }
     free(uses);
@@ -773,6 +822,11 @@ static void set_defaults(struct config *c)
     t->half_press_ms = 500;
     t->hold_ms = 150;
     t->max_hold_ms = 2000;
+    struct process_config *made = &c->process;
+    made->develop_timeout_s = 300;
+    made->panorama_timeout_s = 1800;
+    made->reconstruct_timeout_s = 24 * 3600;
+    made->solve_timeout_s = 12 * 3600;
 }
 
 int config_parse(struct config *out, const char *text, size_t n_bytes, const char *name)

@@ -46,13 +46,39 @@ struct web_config {          // [web], rigd/web.h
     bool token_always;       // on a loopback address, too; others want it anyway
 };
 
+enum develop_quality { DEVELOP_AHD, DEVELOP_BILINEAR, DEVELOP_HALF };
+enum solve_then { SOLVE_THEN_OFF, SOLVE_THEN_STANDARD, SOLVE_THEN_FINAL };
+
+// What happens once the frames are here. Without a [develop] section: nothing; without [solve]: no solve.
+struct process_config {
+    // [develop]
+    bool develop;             // after = on
+    enum develop_quality demosaic;
+    char flat[256];           // frame of an even white, or folder of <camera>.exr; "": none
+    char colour[256];         // gains and scales of all bodies (rigctl calibrate colour), or folder of <camera>.json; "": none
+    int develop_jobs;         // frames at a time; 0: one per core
+    uint32_t memory_mb;       // of developing; 0: half of what the machine has
+    uint32_t develop_timeout_s, panorama_timeout_s;
+    // [reconstruct]
+    char command[190];        // words; the take's path is added. "": none
+    char calibrated[256];     // a fixed rig's mesh.*, cameras and start.json; "": none
+    uint32_t reconstruct_timeout_s;
+    // [solve]
+    bool preview;
+    enum solve_then then;
+    char options[190];        // words for rigsolve solve
+    int solve_threads;        // 0: all cores
+    char solve_program[256];  // "": rigsolve beside rigd
+    uint32_t solve_timeout_s;
+};
+
 enum head_kind { HEAD_NONE, HEAD_MANUAL, HEAD_BOARD }; // the camera stays where it is | a person turns it | the trigger does
 
 struct config_stop { double yaw_deg, pitch_deg; }; // as trigger_head(): yaw to the left seen from above, pitch up
 
 struct panorama_config {     // [panorama]
-    int camera;              // its number; it takes no part in ordinary takes. CONFIG_NONE: there is no [panorama]
-    char camera_name[24];
+    char camera_name[24];    // "": there is no [panorama]
+    int camera;              // its number: config_panorama_camera()
     enum head_kind head;
     struct lens lens;
     double max_angle_deg;
@@ -89,10 +115,17 @@ struct config {
     double lag_max_std_ms;
     struct trigger_config trigger;
     struct web_config web;
+    struct process_config process;
     struct panorama_config panorama;
     int n_cameras;
     struct config_camera *camera; // in the file's order: the camera numbers of all of rigd
 };
+
+// The number of the camera that makes panoramas and takes no part in ordinary takes. CONFIG_NONE: there is none.
+static inline int config_panorama_camera(const struct config *c)
+{
+    return c->panorama.camera_name[0] ? c->panorama.camera : CONFIG_NONE;
+}
 
 // 0; -ENOENT..., -EINVAL (every finding logged, at most 20). *out is zeroed on failure.
 int config_read(struct config *out, const char *path);

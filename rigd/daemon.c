@@ -15,8 +15,10 @@
 #include "rigd/describe.h"
 #include "rigd/doctor.h"
 #include "rigd/manifest.h"
+#include "rigd/products.h"
 #include "rigd/rig.h"
 #include "rigd/web.h"
+#include "rigd/workshop.h"
 #include "solver/take/atomic_file.h"
 #include "solver/take/log.h"
 
@@ -40,7 +42,7 @@
 #include <unistd.h>
 
 #define S INT64_C(1000000000)
-enum { TRIGGER_RETRY_S = 5, WORKERS_END_MS = 1500 };
+enum { TRIGGER_RETRY_S = 5, WORKERS_END_MS = 1500, WAITERS_MAX = 64 };
 
 struct daemon;
 
@@ -61,13 +63,22 @@ struct job {
     char dir[600], id[96]; // of the take, or of all takes
     char *text;
     const struct config *config; // does not change
+    enum take_kind kind;
     struct ledger ledger;
+    struct processing_record *record;
     struct manifest_known *known;
     int n_known;
     char (*paths)[64];
     char (*hashes)[33];
     uint64_t token;
     int newest; // so many takes
+};
+
+// Somebody waits for what becomes of a take.
+struct waiter {
+    uint64_t token; // 0: free
+    char take[96];
+    bool added, preview; // preview: until that is there, not for all
 };
 
 struct daemon {
@@ -95,6 +106,10 @@ struct daemon {
     int n_unfinished;
     uint64_t resume_token; // of the first
     bool resuming;
+    // what is made of takes
+    struct workshop *workshop;
+    struct waiter waiter[WAITERS_MAX];
+    char once_take[96];
     // disk
     pthread_t disk;
     bool disk_runs;
@@ -127,6 +142,7 @@ static void job_free(struct job *j)
     free(j->known);
     free(j->paths);
     free(j->hashes);
+    free(j->record);
     ledger_free(&j->ledger);
     free(j);
 }
@@ -220,7 +236,7 @@ static void done_space(struct daemon *d, struct job *j)
 
 static void work_create(struct job *j)
 {
-    j->err = j->text ? ledger_create(j->text, j->id, j->dir) : -ENOMEM;
+    j->err = j->text ? ledger_create(j->text, j->kind, j->id, j->dir) : -ENOMEM;
 }
 
 static void work_commit(struct job *j)
@@ -580,12 +596,17 @@ static void take_is_done(struct daemon *d)
     struct json *ended = describe_take(l, false);
     json_set_number(ended, "seconds", seconds);
     control_publish(d->control, "take", ended);
+    const bool goes_on = l->state == TAKE_VERIFIED && d->config.process.develop;
+    if (goes_on)
+        workshop_add(d->workshop, l->id, &(struct workshop_request){ .again = -1 });
     if (d->resuming) {
         next_unfinished(d);
         return;
     }
     d->take_token = 0;
-    if (d->once) {
+    if (d->once && goes_on) {
+        snprintf(d->once_take, sizeof(d->once_take), "%s", l->id); // ends when that is settled
+    } else if (d->once) {
         d->exit_code = l->state == TAKE_VERIFIED ? 0 : 1;
         sd_event_exit(d->event, 0);
     }
@@ -674,6 +695,7 @@ static bool add_unfinished(struct daemon *d, const char *id)
     return true;
 }
 
+// Takes of an earlier life: whose frames are not all here, and whose processing is owed.
 static void find_unfinished(struct daemon *d)
 {
     struct dirent **entries = NULL;
@@ -685,6 +707,8 @@ static void find_unfinished(struct daemon *d)
         if (entries[i]->d_name[0] != '.' && !ledger_read(&l, path)) {
             if (l.state != TAKE_VERIFIED && l.state != TAKE_DEVELOPED && l.state != TAKE_SOLVED && l.state != TAKE_FAILED && !strcmp(l.id, entries[i]->d_name))
                 add_unfinished(d, l.id);
+            else if (l.processing == LEDGER_OWED && l.state != TAKE_FAILED && !strcmp(l.id, entries[i]->d_name))
+                workshop_add(d->workshop, l.id, &(struct workshop_request){ .again = -1 });
             ledger_free(&l);
         }
         free(entries[i]);
@@ -718,6 +742,156 @@ static void keep_lag(struct daemon *d)
         lag_write(path, &d->config, serial, lag, when); // says what is wrong itself
     control_reply(d->control, d->lag_token, describe_lag(d->rig, &d->config));
     d->lag_token = 0;
+}
+
+// ---- what is made of takes --------------------------------------------------------------------------------------------------------------
+
+static void work_record(struct job *j)
+{
+    char path[700];
+    snprintf(path, sizeof(path), "%s/%s", j->dir, j->id);
+    j->err = products_record(path, j->record);
+    if (!j->err)
+        j->err = ledger_read(&j->ledger, path);
+}
+
+static void done_record(struct daemon *d, struct job *j)
+{
+    if (!j->err)
+        control_publish(d->control, "take", describe_take(&j->ledger, false));
+    workshop_recorded(d->workshop, j->id, j->err);
+}
+
+static void on_record(void *arg, const char *take, const struct processing_record *record)
+{
+    struct daemon *d = arg;
+    struct job *j = new_job(work_record, done_record);
+    j->record = malloc(sizeof(*j->record));
+    if (!j->record)
+        abort();
+    *j->record = *record;
+    snprintf(j->dir, sizeof(j->dir), "%s", d->takes_dir);
+    snprintf(j->id, sizeof(j->id), "%s", take);
+    give(d, j);
+}
+
+static bool preview_is_there(struct daemon *d, const char *take)
+{
+    struct json *o = workshop_describe(d->workshop, take);
+    bool there = false;
+    for (int i = 0; i < json_length(o, "steps"); i++) {
+        char key[40];
+        const char *step = "", *state = "";
+        snprintf(key, sizeof(key), "steps.%d.step", i);
+        json_get_string(o, key, &step);
+        snprintf(key, sizeof(key), "steps.%d.state", i);
+        json_get_string(o, key, &state);
+        if (!strcmp(step, "preview"))
+            there = !strcmp(state, "done") || !strcmp(state, "failed") || !strcmp(state, "missing") || !strcmp(state, "cancelled");
+    }
+    json_free(o);
+    return there;
+}
+
+static struct json *describe_made(struct daemon *d, const char *take)
+{
+    char path[700];
+    struct json *o = workshop_describe(d->workshop, take);
+    if (!o)
+        o = json_new_object();
+    take_dir(d, take, path, sizeof(path));
+    json_set_string(o, "path", path);
+    return o;
+}
+
+static void answer_waiters(struct daemon *d)
+{
+    for (int i = 0; i < WAITERS_MAX; i++) {
+        struct waiter *w = &d->waiter[i];
+        if (!w->token || !w->added || !(workshop_is_settled(d->workshop, w->take) || (w->preview && preview_is_there(d, w->take))))
+            continue;
+        control_reply(d->control, w->token, describe_made(d, w->take));
+        w->token = 0;
+    }
+}
+
+static void on_changed(void *arg, const char *take, enum processing_step step)
+{
+    struct daemon *d = arg;
+    struct json *o = workshop_describe(d->workshop, take), *body = json_new_object();
+    for (int i = 0; i < json_length(o, "steps"); i++) {
+        char key[40];
+        const char *name = "";
+        struct json *copy = NULL;
+        snprintf(key, sizeof(key), "steps.%d", i);
+        const struct json *s = json_get(o, key);
+        json_get_string(s, "step", &name);
+        char *text = strcmp(name, processing_step_name(step)) ? NULL : json_text(s);
+        if (text && !json_parse(&copy, text, strlen(text), NULL))
+            json_set(body, "step", copy);
+        free(text);
+    }
+    json_set_string(body, "take", take);
+    control_publish(d->control, "processing", body);
+    json_free(o);
+}
+
+static void on_progress(void *arg, const char *take, enum processing_step step, const char *line)
+{
+    struct daemon *d = arg;
+    struct json *body = NULL;
+    if (json_parse(&body, line, strlen(line), NULL))
+        return;
+    json_set_string(body, "take", take);
+    json_set_string(body, "step", processing_step_name(step));
+    control_publish(d->control, "progress", body);
+}
+
+static void on_settled(void *arg, const char *take)
+{
+    struct daemon *d = arg;
+    struct json *o = describe_made(d, take);
+    log_info("take %s: settled", take);
+    for (int i = 0; i < json_length(o, "steps"); i++) {
+        char key[40];
+        const char *step = "", *state = "", *text = "";
+        snprintf(key, sizeof(key), "steps.%d", i);
+        const struct json *s = json_get(o, key);
+        json_get_string(s, "step", &step);
+        json_get_string(s, "state", &state);
+        json_get_string(s, "text", &text);
+        if (!strcmp(state, "failed") || !strcmp(state, "missing"))
+            log_warning("take %s: %s %s: %s", take, step, state, text);
+    }
+    control_publish(d->control, "settled", o);
+    if (d->once && !strcmp(d->once_take, take))
+        sd_event_exit(d->event, 0);
+}
+
+static void on_added(void *arg, uint64_t token, const char *take, int err, const char *why)
+{
+    struct daemon *d = arg;
+    bool waits = false;
+    for (int i = 0; token && i < WAITERS_MAX; i++)
+        if (d->waiter[i].token == token) {
+            waits = d->waiter[i].added = !err;
+            if (err)
+                d->waiter[i].token = 0;
+        }
+    if (err && !token)
+        log_error("take %s: cannot be processed: %s", take, why[0] ? why : strerror(-err));
+    else if (err)
+        control_refuse(d->control, token, err == -EBUSY ? "busy" : "failed", why[0] ? why : strerror(-err));
+    else if (token && !waits)
+        control_reply(d->control, token, describe_made(d, take));
+}
+
+static int on_workshop(sd_event_source *source, int fd, uint32_t events, void *arg)
+{
+    struct daemon *d = arg;
+    (void)source, (void)fd, (void)events;
+    workshop_dispatch(d->workshop);
+    return 0;
 }
 
 // ---- requests ----------------------------------------------------------------------------------------------------------------------------
@@ -854,6 +1028,7 @@ static struct json *describe_all_but_cameras(struct daemon *d)
         snprintf(refusal, sizeof(refusal), "the trigger is %s: check its cable and power; rigctl doctor says more", d->trigger_word);
     if (refusal[0])
         json_set_string(o, "refusal", refusal);
+    json_set(o, "processing", workshop_describe_all(d->workshop));
     if (d->web)
         json_set_string(o, "page", web_address(d->web));
     return o;
@@ -954,8 +1129,15 @@ static void work_report(struct job *j)
     j->err = ledger_read(&j->ledger, path);
     if (j->err)
         return;
-    struct json *o = describe_take(&j->ledger, true);
+    struct json *o = describe_take(&j->ledger, true), *pages = json_new_array();
     json_set_string(o, "path", path);
+    for (int i = 0; i < j->ledger.n_solves; i++) {
+        char page[900];
+        snprintf(page, sizeof(page), "%s/solve/%s/report.html", path, j->ledger.solve[i].name);
+        if (!access(page, R_OK))
+            json_append_string(pages, page);
+    }
+    json_set(o, "pages", pages);
     j->text = json_text(o);
     json_free(o);
 }
@@ -1037,6 +1219,59 @@ static void ask_export(struct daemon *d, uint64_t token, const struct json *requ
         ask_take(d, token, request, work_export);
 }
 
+static void add_for(struct daemon *d, uint64_t token, const char *id, const struct json *request, struct workshop_request r, bool preview)
+{
+    bool wait = false;
+    json_get_bool(request, "wait", &wait);
+    r.token = token;
+    for (int i = 0; wait && i < WAITERS_MAX; i++)
+        if (!d->waiter[i].token) {
+            d->waiter[i] = (struct waiter){ .token = token, .preview = preview };
+            snprintf(d->waiter[i].take, sizeof(d->waiter[i].take), "%s", id);
+            break;
+        }
+    workshop_add(d->workshop, id, &r); // without room for another waiter: answered at once
+}
+
+static void ask_process(struct daemon *d, uint64_t token, const struct json *request)
+{
+    struct workshop_request r = { .again = -1 };
+    const char *again = "";
+    bool cancel = false;
+    char id[96], why[200];
+    json_get_string(request, "again", &again);
+    json_get_bool(request, "cancel", &cancel);
+    if (!take_named(d, token, request, id))
+        return;
+    if (again[0]) {
+        r.again = processing_step_named(again);
+        if (r.again < 0) {
+            snprintf(why, sizeof(why), "no step '%.40s'; there are sheet, develop, panorama, reconstruct, preview, focus, standard, final", again);
+            control_refuse(d->control, token, "refused", why);
+            return;
+        }
+        r.more = 1u << r.again;
+    }
+    if (cancel) {
+        if (workshop_cancel(d->workshop, id))
+            control_refuse(d->control, token, "refused", "nothing of this take is under way");
+        else
+            control_reply(d->control, token, describe_made(d, id));
+        return;
+    }
+    if (!workshop_wanted(d->workshop)) // nothing is configured: what needs no configuration
+        r.more |= 1u << STEP_SHEET | 1u << STEP_DEVELOP | 1u << STEP_PANORAMA | 1u << STEP_FOCUS;
+    add_for(d, token, id, request, r, false);
+}
+
+static void ask_preview(struct daemon *d, uint64_t token, const struct json *request)
+{
+    char id[96];
+    if (take_named(d, token, request, id))
+        add_for(d, token, id, request, (struct workshop_request){ .again = -1, .urgent = true,
+            .more = 1u << STEP_SHEET | 1u << STEP_DEVELOP | 1u << STEP_PANORAMA | 1u << STEP_RECONSTRUCT | 1u << STEP_PREVIEW }, true);
+}
+
 static void ask_doctor(struct daemon *d, uint64_t token, const struct json *request)
 {
     (void)request;
@@ -1053,7 +1288,7 @@ static void on_request(void *arg, uint64_t token, const char *what, const struct
     } requests[] = {
         { "status", ask_status }, { "capture", ask_capture }, { "preflight", ask_preflight }, { "calibrate", ask_calibrate }, { "identify", ask_identify },
         { "reinstate", ask_reinstate }, { "cancel", ask_cancel }, { "takes", ask_takes }, { "report", ask_report }, { "resume", ask_resume }, { "export", ask_export },
-        { "doctor", ask_doctor }, { "metrics", ask_metrics },
+        { "doctor", ask_doctor }, { "metrics", ask_metrics }, { "process", ask_process }, { "preview", ask_preview },
     };
     for (size_t i = 0; i < sizeof(requests) / sizeof(requests[0]); i++)
         if (!strcmp(what, requests[i].what)) {
@@ -1061,7 +1296,7 @@ static void on_request(void *arg, uint64_t token, const char *what, const struct
             return;
         }
     struct daemon *d = arg;
-    control_refuse(d->control, token, "unknown", "expected status, capture, preflight, calibrate, identify, reinstate, cancel, takes, report, resume, export, doctor, metrics or subscribe");
+    control_refuse(d->control, token, "unknown", "expected status, capture, preflight, calibrate, identify, reinstate, cancel, takes, report, resume, process, preview, export, doctor, metrics or subscribe");
 }
 
 static int on_control(sd_event_source *source, int fd, uint32_t events, void *arg)
@@ -1109,6 +1344,7 @@ static void obey(struct daemon *d, const struct rig_action *a)
         return;
     case RIG_CREATE:
         j = new_job(work_create, done_commit);
+        j->kind = l->kind;
         j->text = ledger_text(l);
         snprintf(j->dir, sizeof(j->dir), "%s", d->takes_dir);
         snprintf(j->id, sizeof(j->id), "%s", l->id);
@@ -1198,6 +1434,8 @@ static int look_at_rig(sd_event_source *source, void *arg)
         }
         look_for_work(d);
     }
+    workshop_hold(d->workshop, rig_is_busy(d->rig) || d->resuming);
+    answer_waiters(d);
     const int64_t due = rig_deadline_ns(d->rig);
     sd_event_source_set_time(d->timer, due == INT64_MAX ? UINT64_MAX : (uint64_t)(due / 1000 + 1));
     sd_event_source_set_enabled(d->timer, due == INT64_MAX ? SD_EVENT_OFF : SD_EVENT_ONESHOT);
@@ -1269,6 +1507,8 @@ static int set_up_loop(struct daemon *d)
     if (err >= 0)
         err = sd_event_add_io(d->event, NULL, d->finished_fd, EPOLLIN, on_finished, d);
     if (err >= 0)
+        err = sd_event_add_io(d->event, NULL, workshop_fd(d->workshop), EPOLLIN, on_workshop, d);
+    if (err >= 0)
         err = sd_event_add_post(d->event, &post, look_at_rig, d);
     if (post) {
         sd_event_source_set_enabled(post, SD_EVENT_ON);
@@ -1319,6 +1559,7 @@ static void tear_down(struct daemon *d)
         pthread_mutex_unlock(&d->lock);
         pthread_join(d->disk, NULL);
     }
+    workshop_close(d->workshop); // what it makes is owed
     for (struct job *j = d->finished; j;) {
         struct job *next = j->next;
         job_free(j);
@@ -1369,6 +1610,9 @@ static int run(struct daemon *d)
         err = make_directories(d->takes_dir);
     if (!err)
         err = control_open(&d->control, d->config.socket_path, on_request, d);
+    const struct workshop_host host = { on_record, on_changed, on_progress, on_settled, on_added, d };
+    if (!err)
+        err = workshop_open(&d->workshop, &d->config, d->takes_dir, &host);
     if (!err)
         err = set_up_loop(d);
     if (!err)

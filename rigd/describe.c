@@ -130,6 +130,33 @@ struct json *describe_lag(const struct rig *rig, const struct config *config)
     return o;
 }
 
+static struct json *describe_processing(const struct ledger *l)
+{
+    static const char *const words[LEDGER_N_PROCESSING] = { "none", "owed", "settled", "cancelled" };
+    struct json *o = json_new_object(), *notes = json_new_array(), *solves = json_new_array();
+    int n_developed = 0;
+    for (int i = 0; i < l->n_cameras; i++)
+        n_developed += l->camera[i].developed[0] != 0;
+    json_set_string(o, "state", words[l->processing]);
+    json_set_int(o, "n_developed", n_developed);
+    put(o, "panorama_from", l->panorama_from);
+    for (int i = 0; i < l->n_notes; i++)
+        json_append_string(notes, l->process_note[i]);
+    for (int i = 0; i < l->n_solves; i++) {
+        struct json *e = json_new_object();
+        json_set_string(e, "name", l->solve[i].name);
+        json_set_bool(e, "trusted", l->solve[i].trusted);
+        if (!isnan(l->solve[i].rmse_held_out_percent))
+            json_set_number(e, "rmse_held_out_percent", l->solve[i].rmse_held_out_percent);
+        json_set_number(e, "seconds", l->solve[i].seconds);
+        put(e, "why", l->solve[i].why);
+        json_append(solves, e);
+    }
+    json_set(o, "notes", notes);
+    json_set(o, "solves", solves);
+    return o;
+}
+
 struct json *describe_take(const struct ledger *l, bool with_cameras)
 {
     struct json *o = json_new_object(), *list = json_new_array(), *missing = json_new_array(), *left_out = json_new_array();
@@ -169,6 +196,11 @@ struct json *describe_take(const struct ledger *l, bool with_cameras)
             json_append(files, f);
         }
         json_set(e, "files", files);
+        if (c->developed[0]) {
+            json_set_string(e, "developed", c->developed);
+            json_set_number(e, "clipped_share", c->clipped_share);
+            json_set_number(e, "developed_s", c->developed_s);
+        }
         json_append(list, e);
     }
     json_set_string(o, "id", l->id);
@@ -190,6 +222,8 @@ struct json *describe_take(const struct ledger *l, bool with_cameras)
         json_set_number(o, "jitter_ms", 1e-6 * (double)l->jitter_ns);
     json_set(o, "missing", missing);
     json_set(o, "left_out", left_out);
+    if (l->processing)
+        json_set(o, "processing", describe_processing(l));
     if (with_cameras)
         json_set(o, "cameras", list);
     else

@@ -208,6 +208,22 @@ static bool is_in_circle(const struct lens *l, const double px[2])
     return l->circle_px == 0 || hypot(px[0] - l->centre_px[0], px[1] - l->centre_px[1]) <= l->circle_px;
 }
 
+struct json *lens_json(const struct lens *l)
+{
+    struct json *o = json_new_object();
+    const double distortion[5] = { l->k[0], l->k[1], l->k[2], l->p[0], l->p[1] };
+    json_set_string(o, "model", lens_model_name(l->model));
+    json_set_int(o, "width_px", l->width_px);
+    json_set_int(o, "height_px", l->height_px);
+    json_set_number(o, "focal_px", l->focal_px);
+    json_set_numbers(o, "centre_px", l->centre_px, 2);
+    json_set_numbers(o, "distortion", distortion, 5);
+    json_set_number(o, "circle_px", l->circle_px);
+    json_set_number(o, "max_angle_deg", l->max_angle_rad * 180 / M_PI);
+    json_set_numbers(o, "shading", l->v, 3);
+    return o;
+}
+
 bool lens_project(const struct lens *l, const double dir[3], double px[2])
 {
     const double across = hypot(dir[0], dir[1]), a = atan2(across, dir[2]);
@@ -255,6 +271,18 @@ double lens_shading(const struct lens *l, const double px[2])
 {
     const double x = (px[0] - l->centre_px[0]) / l->focal_px, y = (px[1] - l->centre_px[1]) / l->focal_px, t = x * x + y * y;
     return 1 + t * (l->v[0] + t * (l->v[1] + t * l->v[2]));
+}
+
+double lens_reach_px(const struct lens *l)
+{
+    double reach = 0;
+    for (int i = 0; i < 64; i++) {
+        const double b = 2 * M_PI * i / 64, u[2] = { l->max_r * cos(b), l->max_r * sin(b) };
+        double d[2], J[4];
+        distort(l, u, d, J);
+        reach = fmax(reach, l->focal_px * hypot(d[0], d[1]));
+    }
+    return l->circle_px > 0 ? fmin(reach, l->circle_px) : reach;
 }
 
 void lens_head(double R[9], double yaw, double pitch, double roll)

@@ -33,6 +33,7 @@ int lens_init(struct lens *lens, const char *name);
 // and the middle: "centre_px" [2], "distortion" [k1, k2, k3, p1, p2], "circle_px", "max_angle_deg", "shading" [v1, v2, v3].
 // 0; -EINVAL, logged. Ends with lens_init.
 int lens_from_json(struct lens *out, const struct json *v, const char *path, const char *name);
+struct json *lens_json(const struct lens *lens); // what lens_from_json reads
 const char *lens_model_name(enum lens_model m);
 
 // False: not seen (too far from the axis, outside the circle). The pixel may be outside the frame. dir need not be unit.
@@ -42,6 +43,8 @@ bool lens_ray(const struct lens *lens, const double px[2], double dir[3]);
 // Steradians per square pixel at px; 0 where lens_ray is false.
 double lens_solid_angle(const struct lens *lens, const double px[2]);
 double lens_shading(const struct lens *lens, const double px[2]);
+// No pixel further than this from centre_px is seen.
+double lens_reach_px(const struct lens *lens);
 
 // The head holds the camera: yaw to the left seen from above, then pitch up, then roll: the camera turns clockwise seen from behind
 // it. All 0: it looks along the probe's +Z (the panorama's middle) with +Y upwards, so that x (right in the image) is the probe's -X.

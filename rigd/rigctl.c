@@ -18,9 +18,9 @@
 enum { EXIT_DONE = 0, EXIT_FAILED = 1, EXIT_USAGE = 2, LINE_MAX_BYTES = 64 << 20 };
 
 struct arguments {
-    const char *socket_path, *name, *word[3];
+    const char *socket_path, *name, *again, *word[3];
     int n_words, shots;
-    bool json, watch, without_missing;
+    bool json, watch, without_missing, cancel, open;
 };
 
 struct line_reader {
@@ -122,9 +122,32 @@ static bool flag_of(const struct json *v, const char *path)
     return b;
 }
 
+// One line when a step changes, another when it is done; how far it has come goes over the line before on a terminal.
+static void print_step_event(const struct json *body)
+{
+    static char last[200];
+    char line[200];
+    const char *state = text_of(body, "step.state");
+    const double n = number_of(body, "step.n", 0);
+    if (!strcmp(state, "looking") || !strcmp(state, "waiting") || !strcmp(state, "queued"))
+        return;
+    if (!strcmp(state, "running") && n > 1)
+        snprintf(line, sizeof(line), "  %s: %.0f of %.0f", text_of(body, "step.step"), number_of(body, "step.n_done", 0), n);
+    else
+        snprintf(line, sizeof(line), "  %s: %s%s%.120s", text_of(body, "step.step"), state, text_of(body, "step.text")[0] ? ": " : "", text_of(body, "step.text"));
+    if (strcmp(line, last))
+        fprintf(stderr, "%s\n", line);
+    snprintf(last, sizeof(last), "%s", line);
+}
+
 static void print_event(const struct json *message)
 {
     const char *event = text_of(message, "event");
+    if (!strcmp(event, "processing"))
+        print_step_event(json_get(message, "body"));
+    else if (!strcmp(event, "progress") && isatty(2))
+        fprintf(stderr, "  %s: %s %.0f of %.0f\033[K\r", text_of(message, "body.step"), text_of(message, "body.stage"), number_of(message, "body.done", 0),
+                number_of(message, "body.total", 0));
     if (!strcmp(event, "state"))
         fprintf(stderr, "  %s\n", text_of(message, "body.state"));
     else if (!strcmp(event, "say"))
@@ -148,7 +171,10 @@ static struct json *ask(const struct arguments *a, struct json *request, bool ev
     send_request(r.fd, request);
     for (struct json *m; !answer && (m = next_message(&r));) {
         int64_t id = -1;
-        if (json_get(m, "event"))
+        const char *about = text_of(m, "body.take"), *take = a->n_words > 1 ? a->word[1] : "";
+        if (json_get(m, "event") && about[0] && take[0] && strcmp(about, take))
+            ; // another take's
+        else if (json_get(m, "event"))
             print_event(m);
         else if (!json_get_int(m, "id", &id) && id == 1)
             answer = m;
@@ -211,6 +237,29 @@ static void print_take(const struct json *t)
         }
 }
 
+static void print_step(const struct json *e)
+{
+    printf("  %-12s %-10s", text_of(e, "step"), text_of(e, "state"));
+    if (number_of(e, "n", 0) > 1)
+        printf(" %3.0f of %-3.0f", number_of(e, "n_done", 0), number_of(e, "n", 0));
+    else if (number_of(e, "total", 0) > 0)
+        printf(" %s %.0f of %.0f", text_of(e, "stage"), number_of(e, "done", 0), number_of(e, "total", 0));
+    else
+        fputs("           ", stdout);
+    if (json_get(e, "ended_s") && number_of(e, "ended_s", 0) > 0)
+        printf(" %7.1f s .. %7.1f s", number_of(e, "began_s", 0), number_of(e, "ended_s", 0));
+    printf("%s%s\n", text_of(e, "text")[0] ? "  " : "", text_of(e, "text"));
+}
+
+static void print_process(const struct json *t)
+{
+    if (!text_of(t, "take")[0])
+        return;
+    printf("take %s: %s\n", text_of(t, "take"), flag_of(t, "settled") ? "settled" : "under way");
+    for (int i = 0; i < json_length(t, "steps"); i++)
+        print_step(element(t, "steps", i));
+}
+
 static void print_status(const struct json *s)
 {
     printf("%s: %s, %.0f of %.0f cameras ready, %.0f quarantined; trigger %s\n", text_of(s, "name"), text_of(s, "state"), number_of(s, "n_ready", 0),
@@ -230,6 +279,9 @@ static void print_status(const struct json *s)
         print_number("%8.2f", number_of(c, "lag_ms", NAN), "       -");
         printf("  %s\n", text_of(c, "note"));
     }
+    for (int i = 0; i < json_length(s, "processing"); i++)
+        if (!flag_of(element(s, "processing", i), "settled"))
+            print_process(element(s, "processing", i));
 }
 
 static void print_findings(const struct json *f)
@@ -260,7 +312,7 @@ static void print_lag(const struct json *l)
 // Ask; with --json print the result as it is, else by print. 0 and *out (if wanted), or EXIT_FAILED.
 static int ask_and_print(const struct arguments *a, struct json *request, bool events, void (*print)(const struct json *), struct json **out)
 {
-    struct json *answer = ask(a, request, events && !a->json && isatty(2));
+    struct json *answer = ask(a, request, events && !a->json && (isatty(2) || a->watch));
     if (!answer)
         return EXIT_FAILED;
     const struct json *result = json_get(answer, "result");
@@ -360,28 +412,110 @@ static void print_report(const struct json *t)
             const struct json *f = element(c, "files", k);
             printf("  %s %.0f %s", text_of(f, "file"), number_of(f, "size", 0), text_of(f, "xxh128"));
         }
+        if (json_get(c, "developed"))
+            printf("  %s clipped %.2f %%", text_of(c, "developed"), 100 * number_of(c, "clipped_share", 0));
         printf("%s%s\n", text_of(c, "note")[0] ? "  " : "", text_of(c, "note"));
     }
+    for (int i = 0; i < json_length(t, "processing.solves"); i++) {
+        const struct json *v = element(t, "processing.solves", i);
+        printf("  solve %-9s", text_of(v, "name"));
+        print_number(" RMSE of views set aside %.3f %%", number_of(v, "rmse_held_out_percent", NAN), "");
+        printf(" in %.1f s%s%s\n", number_of(v, "seconds", 0), flag_of(v, "trusted") ? "" : "; ", text_of(v, "why"));
+    }
+    for (int i = 0; i < json_length(t, "processing.notes"); i++) {
+        char key[40];
+        snprintf(key, sizeof(key), "processing.notes.%d", i);
+        printf("  note: %s\n", text_of(t, key));
+    }
+    for (int i = 0; i < json_length(t, "pages"); i++) {
+        char key[40];
+        snprintf(key, sizeof(key), "pages.%d", i);
+        printf("  page: %s\n", text_of(t, key));
+    }
+}
+
+// The newest page in the desktop's browser.
+static int open_page(const struct json *t)
+{
+    const int n = json_length(t, "pages");
+    char key[40];
+    snprintf(key, sizeof(key), "pages.%d", n - 1);
+    if (n < 1) {
+        log_error("there is no page yet: no solve of this take has ended; rigctl process %s --watch", text_of(t, "id"));
+        return EXIT_FAILED;
+    }
+    const char *page = "";
+    json_get_string(t, key, &page);
+    execlp("xdg-open", "xdg-open", page, (char *)NULL);
+    log_error("cannot run xdg-open: %s; open it by hand: %s", strerror(errno), page);
+    return EXIT_FAILED;
 }
 
 static int report(const struct arguments *a)
 {
-    return ask_and_print(a, about_take("report", a->word[1]), false, print_report, NULL);
+    struct json *answer = NULL;
+    int err = ask_and_print(a, about_take("report", a->word[1]), false, print_report, &answer);
+    fflush(stdout);
+    if (!err && a->open)
+        err = open_page(json_get(answer, "result"));
+    json_free(answer);
+    return err;
+}
+
+// Exit status of what was made of a take: failed if a step is.
+static int outcome_of(const struct json *t)
+{
+    for (int i = 0; i < json_length(t, "steps"); i++) {
+        const char *state = text_of(element(t, "steps", i), "state");
+        if (!strcmp(state, "failed") || !strcmp(state, "missing") || !strcmp(state, "cancelled"))
+            return EXIT_FAILED;
+    }
+    return EXIT_DONE;
+}
+
+static int process(const struct arguments *a)
+{
+    struct json *r = about_take("process", a->word[1]), *answer = NULL;
+    if (a->again)
+        json_set_string(r, "again", a->again);
+    json_set_bool(r, "cancel", a->cancel);
+    json_set_bool(r, "wait", a->watch);
+    if (a->watch && !a->json)
+        fprintf(stderr, "take %s\n", a->word[1]);
+    const int err = ask_and_print(a, r, a->watch, print_process, &answer);
+    const int code = err ? err : a->watch ? outcome_of(json_get(answer, "result")) : EXIT_DONE;
+    json_free(answer);
+    return code;
+}
+
+static bool print_path(const char *what, const char *take, const char *name)
+{
+    char path[1200];
+    snprintf(path, sizeof(path), "%s/%s", take, name);
+    if (access(path, R_OK))
+        return false;
+    printf("  %-10s %s\n", what, path);
+    return true;
 }
 
 static void print_preview(const struct json *t)
 {
-    for (int i = 0; i < json_length(t, "cameras"); i++) {
-        char path[1024];
-        const struct json *c = element(t, "cameras", i);
-        snprintf(path, sizeof(path), "%s/thumbnails/%s.jpg", text_of(t, "path"), text_of(c, "camera"));
-        printf("%s %s\n", text_of(c, "camera"), access(path, R_OK) ? "-" : path);
-    }
+    const char *take = text_of(t, "path");
+    print_process(t);
+    if (!print_path("sheet", take, "sheet/linear.png"))
+        print_path("sheet", take, "sheet/thumbnails.png");
+    print_path("model", take, "solve/preview/model.glb");
+    print_path("page", take, "solve/preview/report.html");
 }
 
 static int preview(const struct arguments *a)
 {
-    return ask_and_print(a, about_take("report", a->word[1]), false, print_preview, NULL);
+    struct json *r = about_take("preview", a->word[1]), *answer = NULL;
+    json_set_bool(r, "wait", true);
+    const int err = ask_and_print(a, r, true, print_preview, &answer);
+    const int code = err ? err : outcome_of(json_get(answer, "result"));
+    json_free(answer);
+    return code;
 }
 
 static void print_export(const struct json *e)
@@ -493,8 +627,9 @@ static const struct {
     { "capture", NULL, capture, "make a take; --name, --without-missing" },
     { "cancel", NULL, cancel, "stop a take; after the shot its frames are fetched all the same" },
     { "takes", NULL, takes, "list takes" },
-    { "report", "TAKE", report, "one take, camera by camera" },
-    { "preview", "TAKE", preview, "where a take's thumbnails are" },
+    { "report", "TAKE", report, "one take, camera by camera, and its pages; --open: show the newest" },
+    { "process", "TAKE", process, "develop, panorama, solve: what is missing; --again STEP, --cancel, --watch" },
+    { "preview", "TAKE", preview, "contact sheet, then the quick solve; before all other work" },
     { "resume", "TAKE", resume, "fetch what a take still misses" },
     { "export", "TAKE", export, "write and check a take's ASC MHL manifest for hand-over" },
     { "calibrate", "lag", calibrate, "measure each body's shutter lag; --shots" },
@@ -508,7 +643,10 @@ enum { N_COMMANDS = sizeof(commands) / sizeof(commands[0]) };
 static const struct argp_option option_list[] = {
     { "socket", 's', "PATH", 0, "rigd's socket (RIGD_SOCKET, else /run/rigd/rigd.sock)", 0 },
     { "json", 'j', NULL, 0, "print the answer as JSON", 0 },
-    { "watch", 'w', NULL, 0, "status: live", 0 },
+    { "watch", 'w', NULL, 0, "status: live; process: until it is settled", 0 },
+    { "again", 'a', "STEP", 0, "process: make it anew: sheet, develop, panorama, reconstruct, preview, focus, standard, final", 0 },
+    { "cancel", 'c', NULL, 0, "process: stop", 0 },
+    { "open", 'o', NULL, 0, "report: show the newest page", 0 },
     { "name", 'n', "NAME", 0, "capture: of the take", 0 },
     { "without-missing", 'm', NULL, 0, "capture: leave cameras out that are not fit", 0 },
     { "shots", 'k', "N", 0, "calibrate: how many (rigd.conf's)", 0 },
@@ -530,6 +668,15 @@ static error_t parse(int key, char *arg, struct argp_state *state)
         return 0;
     case 'n':
         a->name = arg;
+        return 0;
+    case 'a':
+        a->again = arg;
+        return 0;
+    case 'c':
+        a->cancel = true;
+        return 0;
+    case 'o':
+        a->open = true;
         return 0;
     case 'm':
         a->without_missing = true;

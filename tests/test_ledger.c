@@ -232,7 +232,7 @@ static int whole_story(void)
         on_card(&l.camera[i].before[0], i, 1);
     }
     char *text = ledger_text(&l);
-    int err = ledger_create(text, ID, takes);
+    int err = ledger_create(text, TAKE_CAPTURE, ID, takes);
     free(text);
     if (!err)
         err = finish_take(&l);
@@ -501,7 +501,7 @@ static void frames_of_later_takes_are_not_ours(void **state)
         on_card(&l.camera[i].before[0], i, 4);
     strcpy(l.id, "20261122T100000000_later");
     char *later = ledger_text(&l);
-    assert_int_equal(ledger_create(later, l.id, takes), 0);
+    assert_int_equal(ledger_create(later, TAKE_CAPTURE, l.id, takes), 0);
     free(later);
     ledger_free(&l);
     assert_int_equal(ledger_read(&l, take_dir), 0);
