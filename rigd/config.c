@@ -132,7 +132,7 @@ static const struct key panorama_keys[] = {
 _Static_assert(offsetof(struct lens, p) == offsetof(struct lens, k) + sizeof(((struct lens *)0)->k), "distortion is read as one list");
 #define COUNT(keys) ((int)(sizeof(keys) / sizeof((keys)[0])))
 
-enum section { NO_SECTION, RIG, SETTINGS, CALIBRATION, TRIGGER, PANORAMA, DEVELOP, RECONSTRUCT, SOLVE, WEB, CAMERA, BAD_SECTION };
+enum section { NO_SECTION, RIG, SETTINGS, CALIBRATION, TRIGGER, PANORAMA, WEB, DEVELOP, RECONSTRUCT, SOLVE, CAMERA, BAD_SECTION };
 static const struct {
     const char *name;
     const struct key *keys;

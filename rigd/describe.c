@@ -69,6 +69,8 @@ struct json *describe_rig(const struct rig *rig, const struct config *config, co
     put(o, "outcome", rig_outcome(rig));
     json_set_string(o, "trigger", trigger);
     json_set_string(o, "takes_dir", config->takes_dir);
+    if (config_panorama_camera(config) != CONFIG_NONE)
+        json_set_string(o, "panorama_camera", config->panorama.camera_name);
     if (l)
         json_set(o, "take", describe_take(l, false));
     for (int i = 0; i < config->n_cameras; i++)

@@ -16,10 +16,8 @@ enum { PARTS_MAX = 3, PART_MAX_BYTES = 100 };
 static const struct {
     const char *path, *what, *type;
 } known[] = {
-    { "contact_sheet.html", "contact sheet", "text/html; charset=utf-8" },
-    { "contact_sheet.jpg", "contact sheet", "image/jpeg" },
-    { "contact_sheet.png", "contact sheet", "image/png" },
-    { "report.html", "report", "text/html; charset=utf-8" },
+    { "sheet/linear.png", "contact sheet", "image/png" },
+    { "sheet/thumbnails.png", "contact sheet (thumbnails)", "image/png" },
     { "solve/*/report.html", "report", "text/html; charset=utf-8" },
     { "solve/*/model.glb", "model", "model/gltf-binary" },
     { "thumbnails/*.jpg", NULL, "image/jpeg" },

@@ -368,9 +368,9 @@ static void files_of_takes_are_shown_and_no_others(void **state)
 {
     static const char *const shown[][2] = {
         { "T1/thumbnails/A01.jpg", "image/jpeg" }, { "T1/solve/preview/report.html", "text/html; charset=utf-8" },
-        { "T1/solve/preview/model.glb", "model/gltf-binary" }, { "T1/contact_sheet.jpg", "image/jpeg" },
+        { "T1/solve/preview/model.glb", "model/gltf-binary" }, { "T1/sheet/linear.png", "image/png" },
     };
-    static const char *const hidden[] = { "T1/take.json", "T1/raw/A01.nef", "T1/solve/preview/lights.json", "T1/thumbnails/.A02.jpg", "secret.jpg", "T1/thumbnails/deep/A.jpg" };
+    static const char *const hidden[] = { "T1/take.json", "T1/raw/A01.nef", "T1/sheet/linear.json", "T1/report.html", "T1/solve/preview/lights.json", "T1/thumbnails/.A02.jpg", "secret.jpg", "T1/thumbnails/deep/A.jpg" };
     static const char *const tricks[] = {
         "/takes/T1/thumbnails/../../secret.jpg", "/takes/T1/thumbnails/%2e%2e/%2e%2e/secret.jpg", "/takes/T1/thumbnails/..%2f..%2fsecret.jpg", "/takes/../secret.jpg", "/takes/..",
         "/takes/T1/thumbnails/%00A01.jpg", "/takes/T1/take.json%00.jpg", "/takes/T1/thumbnails//A01.jpg", "/takes//T1/thumbnails/A01.jpg", "/takes/T1/./thumbnails/A01.jpg",

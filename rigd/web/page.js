@@ -10,6 +10,7 @@ const $ = id => document.getElementById(id);
 let rig = null;           // `status`, but for its cameras
 let takes = [];
 let connected = false, pressed = false; // pressed: rigd has not answered yet
+let head = null;          // where a panorama is
 let source = null, heardAt = 0, version = "";
 const cameras = new Map(); // name: { data, card }
 
@@ -129,9 +130,9 @@ function showButtons() {
     $("capture").disabled = !free;
     $("preflight").disabled = !connected || !rig || busy;
     $("cancel").hidden = !busy;
-    $("panorama").hidden = !rig || !rig.panorama;
+    $("panorama").hidden = !rig || !rig.panorama_camera;
     $("panorama").disabled = !free;
-    $("continue").hidden = !(busy && rig.panorama && rig.panorama.waiting);
+    $("continue").hidden = !(busy && rig.prompt);
     for (const c of cameras.values()) for (const b of c.card.querySelectorAll("button")) b.disabled = !connected;
 }
 
@@ -142,11 +143,26 @@ function showNow() {
     let text = rig.state === "idle" ? "busy" : rig.state;
     if (take && rig.state !== "idle") {
         text = take.name + ": " + rig.state;
-        if (["collecting", ...ENDED].includes(rig.state)) text += ", " + take.n_delivered + " of " + take.n_expected + " cameras, " + take.n_frames + " frames, " + megabytes(take.bytes);
+        if (head && head.take === take.id) {
+            text += ", stop " + head.stop + " of " + head.n_stops + (head.frame ? ", exposure " + head.frame + " (" + head.exposure + " s)" : "") + (head.text ? ": " + head.text : "");
+        } else if (["collecting", ...ENDED].includes(rig.state)) text += ", " + take.n_delivered + " of " + take.n_expected + " cameras, " + take.n_frames + " frames, " + megabytes(take.bytes);
     }
     setText($("state"), sentence(text));
+    $("prompt").hidden = !rig.prompt;
+    setText($("prompt"), rig.prompt || "");
     $("progress").max = take && take.n_expected ? take.n_expected : 1;
     $("progress").value = take ? take.n_delivered : 0;
+}
+
+// What is made of takes now: develop: 3 of 12; preview: waiting.
+function showMaking() {
+    const making = (rig.processing || []).filter(p => !p.settled);
+    $("making").hidden = !making.length;
+    $("making").replaceChildren(...making.map(p => {
+        const steps = p.steps.filter(s => s.state !== "done");
+        return element("li", p.take.split("_").slice(1).join("_") + ": " + steps.map(s => s.step + " " + s.state + (s.n > 1 ? " " + s.n_done + " of " + s.n : "") +
+            (s.total ? ", " + s.stage + " " + Math.floor(100 * s.done / s.total) + " %" : "") + (s.text ? ": " + s.text : "")).join("; "));
+    }));
 }
 
 function showRig(data) {
@@ -158,6 +174,7 @@ function showRig(data) {
     document.title = rig.name + ": " + (rig.busy ? rig.state : "rig");
     setText($("count"), rig.n_ready + " of " + rig.n_cameras + " ready" + (rig.n_quarantined ? ", " + rig.n_quarantined + " quarantined" : "") + "; trigger " + rig.trigger);
     showNow();
+    showMaking();
     showButtons();
     if (!before || before.busy !== rig.busy || before.state !== rig.state) showPictures();
     if (before && before.busy && !rig.busy) askTakes();
@@ -235,12 +252,23 @@ function showTake(take) {
     if (take.reason) li.append(element("p", sentence(take.reason), "bad"));
     if (missing.length) li.append(element("p", "Missing: " + missing.join(", "), "bad"));
     if (take.left_out.length) li.append(element("p", "Left out: " + take.left_out.map(m => m.camera).join(", ")));
+    for (const s of take.processing ? take.processing.solves : []) {
+        li.append(element("p", s.name + " solve: " + (s.rmse_held_out_percent !== undefined ? "held-out error " + s.rmse_held_out_percent.toFixed(2) + " %, " : "") +
+            (s.trusted ? "trusted" : "not to be trusted" + (s.why ? ": " + s.why : "")), s.trusted ? "" : "bad"));
+    }
+    for (const note of take.processing ? take.processing.notes : []) li.append(element("p", note, "bad"));
     for (const file of take.files) {
         const a = element("a", file.what + (file.path.startsWith("solve/") ? " (" + file.path.split("/")[1] + ")" : ""));
         a.href = "takes/" + take.id + "/" + file.path;
         a.target = "_blank";
         a.rel = "noopener";
         li.append(a);
+    }
+    if (take.kind !== "panorama" && take.n_delivered && !take.files.some(f => f.path.startsWith("solve/"))) {
+        const preview = element("button", "Preview");
+        preview.type = "button";
+        preview.onclick = () => press({ do: "preview", take: take.id }, () => showOutcome("take " + take.id + " is being processed"));
+        li.append(preview, " ");
     }
     if (missing.length) {
         const resume = element("button", "Fetch what is missing");
@@ -296,7 +324,10 @@ function take(message) {
         if (message.id === "status" && message.ok) showStatus(message.result);
         return;
     case "alive":
-    case "state": // "rig" says it too
+    case "state": // "rig" says these too
+    case "prompt":
+    case "processing":
+    case "progress":
         return;
     case "rig":
         showRig(message.body);
@@ -304,6 +335,10 @@ function take(message) {
     case "cameras":
         message.body.cameras.forEach(showCamera);
         showButtons();
+        return;
+    case "panorama":
+        head = message.body;
+        showNow();
         return;
     case "say":
         say(message.body);
