@@ -66,6 +66,18 @@ $page->{events} = [];
 $page->go($rig->url);
 ok $page->until_true('!document.querySelector("#capture").disabled'), 'back on the page';
 
+# what this rig has not: a panorama head, and takes that are processed; as rigd tells of them
+ok $page->js('document.querySelector("#panorama").hidden'), 'without [panorama] there is no button for it';
+$page->js('take({ event: "rig", body: Object.assign({}, rig, { busy: true, state: "exposing", panorama_camera: "P01", prompt: "Turn the head to 90 degrees", take: Object.assign({}, takes[0], { id: "T", name: "lights" }),'
+    . ' processing: [{ take: "20261122T100000000_vase", settled: false, steps: [{ step: "sheet", state: "done" }, { step: "develop", state: "running", n: 6, n_done: 2 }, { step: "preview", state: "waiting" }] }] }) });'
+    . 'take({ event: "panorama", body: { take: "T", step: "expose", stop: 2, n_stops: 6, frame: 3, exposure: "1/60" } })');
+is $text->('#prompt'), 'Turn the head to 90 degrees', 'what a person has to do is told';
+ok !$page->js('document.querySelector("#continue").hidden || document.querySelector("#panorama").hidden || document.querySelector("#cancel").hidden'), '... with a button that says it is done';
+is $text->('#state'), 'Lights: exposing, stop 2 of 6, exposure 3 (1/60 s).', '... and where the panorama is';
+is $text->('#making'), 'vase: develop running 2 of 6; preview waiting', 'how far the processing of a take has come';
+$page->go($rig->url);
+ok $page->until_true('!document.querySelector("#capture").disabled'), 'back on the page';
+
 for my $width (360, 800, 1400) {
     $page->size($width, 900);
     sleep .2;
