@@ -1,7 +1,7 @@
 // rigd/web.c - the only file that knows libmicrohttpd.
 //
-// Each connection has a thread of the library's. It may wait - for an answer, for the next event - but never without watching two
-// more descriptors: the browser's, which may leave, and `stop`, by which web_close() ends it. So no connection is ever suspended.
+// Each connection has a thread of the library's. It may wait - for an answer, for the next event - but never without watching the
+// browser's descriptor, too: a browser may leave, and to stop is to shut all of them down. So no connection is ever suspended.
 #include "rigd/web.h"
 #include "rigd/access.h"
 #include "rigd/control.h"
@@ -17,7 +17,6 @@
 #include <stdio.h>
 #include <stdlib.h>
 #include <string.h>
-#include <sys/eventfd.h>
 #include <sys/socket.h>
 #include <sys/un.h>
 #include <time.h>
@@ -70,7 +69,6 @@ struct visitor {
 struct web {
     struct MHD_Daemon *http;
     const struct config *config;
-    int stop_fd; // readable: everything ends
     bool needs_token;
     char token[ACCESS_TOKEN_LENGTH + 1], cookie[20], address[100];
     pthread_mutex_t lock; // of what follows
@@ -174,25 +172,25 @@ static bool send_all(int fd, const char *bytes, size_t n)
     return true;
 }
 
-// Waits until rigd has said something. 1; 0: timeout_ms passed; -1: the browser has left, or everything ends.
-static int wait_for(const struct web *w, int rigd_fd, int browser_fd, int timeout_ms)
+// Waits until rigd has said something. 1; 0: timeout_ms passed; -1: the browser has left, or was sent away.
+static int wait_for(int rigd_fd, int browser_fd, int timeout_ms)
 {
-    struct pollfd p[3] = { { rigd_fd, POLLIN, 0 }, { browser_fd, POLLRDHUP, 0 }, { w->stop_fd, POLLIN, 0 } };
+    struct pollfd p[2] = { { rigd_fd, POLLIN, 0 }, { browser_fd, POLLRDHUP, 0 } };
     int n;
     do
-        n = poll(p, 3, timeout_ms);
+        n = poll(p, 2, timeout_ms);
     while (n < 0 && errno == EINTR);
-    if (n < 0 || p[1].revents || p[2].revents)
+    if (n < 0 || p[1].revents)
         return -1;
     return n > 0;
 }
 
 // Reads one line, without its end. NULL: there will be none.
-static char *read_line(const struct web *w, int rigd_fd, int browser_fd, size_t *n_bytes)
+static char *read_line(int rigd_fd, int browser_fd, size_t *n_bytes)
 {
     char *text = NULL;
     size_t n = 0, room = 0;
-    while (wait_for(w, rigd_fd, browser_fd, -1) > 0) {
+    while (wait_for(rigd_fd, browser_fd, -1) > 0) {
         if (n == room) {
             room = room ? 2 * room : BLOCK_BYTES;
             char *grown = room <= ANSWER_MAX_BYTES ? realloc(text, room) : NULL;
@@ -269,7 +267,7 @@ static enum MHD_Result answer_request(struct web *w, struct MHD_Connection *conn
     MHD_set_connection_option(connection, MHD_CONNECTION_OPTION_TIMEOUT, 0u); // a take lasts longer than the library waits
     const int rigd_fd = connect_to_rigd(w);
     if (rigd_fd >= 0 && send_all(rigd_fd, body, n) && send_all(rigd_fd, "\n", 1))
-        answer = read_line(w, rigd_fd, browser_fd, &n_answer);
+        answer = read_line(rigd_fd, browser_fd, &n_answer);
     if (rigd_fd >= 0)
         close(rigd_fd);
     MHD_set_connection_option(connection, MHD_CONNECTION_OPTION_TIMEOUT, (unsigned)IDLE_S); // counts from now
@@ -296,7 +294,7 @@ static ssize_t next_events(void *arg, uint64_t position, char *out, size_t room)
     char bytes[BLOCK_BYTES / 8];
     (void)position;
     for (;;) {
-        const int said = wait_for(s->web, s->rigd_fd, s->browser_fd, ALIVE_MS);
+        const int said = wait_for(s->rigd_fd, s->browser_fd, ALIVE_MS);
         if (said < 0)
             return MHD_CONTENT_READER_END_OF_STREAM;
         if (!said && !s->within && room >= sizeof(alive)) {
@@ -552,8 +550,7 @@ int web_open(struct web **out, const struct config *config)
         return -ENOMEM;
     w->config = config;
     pthread_mutex_init(&w->lock, NULL);
-    w->stop_fd = eventfd(0, EFD_CLOEXEC | EFD_NONBLOCK);
-    err = w->stop_fd < 0 ? -errno : listen_parse(&address, config->web.listen);
+    err = listen_parse(&address, config->web.listen);
     if (err)
         goto fail;
     w->needs_token = !address.is_loopback || config->web.token_always;
@@ -602,15 +599,10 @@ fail:
 
 void web_close(struct web *w)
 {
-    const uint64_t one = 1;
     if (!w)
         return;
-    if (w->http && write(w->stop_fd, &one, sizeof(one)) < 0) // never read: all who wait see it
-        log_error("web: cannot tell the connections to end: %s", strerror(errno));
     if (w->http)
-        MHD_stop_daemon(w->http);
-    if (w->stop_fd >= 0)
-        close(w->stop_fd);
+        MHD_stop_daemon(w->http); // shuts down every connection, which ends whatever waits, and joins its thread
     pthread_mutex_destroy(&w->lock);
     free(w);
 }
