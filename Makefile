@@ -12,7 +12,7 @@ MACHINE := $(shell uname -m)
 
 # ---- packages (Debian 12; the same names in Debian 13) ----------------------------------------------------------------
 PACKAGES := gcc make pkg-config libopenexr-dev libembree-dev libassimp-dev libjansson-dev libtiff-dev libpng-dev libjpeg-dev libexpat1-dev liblapacke-dev libopenblas-dev libcmocka-dev perl help2man \
-  libgphoto2-dev libgpiod-dev libinih-dev libraw-dev libsystemd-dev libumockdev-dev libxxhash-dev
+  libgphoto2-dev libgpiod-dev libinih-dev libraw-dev libsystemd-dev libumockdev-dev libusb-1.0-0-dev libxxhash-dev
 PACKAGES_FUZZ := clang libclang-rt-dev
 PACKAGES_BENCH := libceres-dev g++ gnuplot-nox
 
@@ -39,7 +39,7 @@ RIG_PROGRAMS := rigctl rigd rigd-camera rigd-unpack
 RIG := $(filter-out $(addprefix rigd/,camera_gphoto.c camera_worker.c daemon.c develop.c main.c rigctl.c unpack.c),$(wildcard rigd/*.c))
 RIGSIM := $(wildcard tests/rigsim/*.c)
 RIGSIM_LIB := $(filter-out $(addprefix tests/rigsim/,client.c main.c server.c server_faults.c server_shutter.c),$(RIGSIM))
-LIBS_RIG = -ljansson -linih -lsystemd -lxxhash -lgpiod -lm
+LIBS_RIG = -ljansson -lusb-1.0 -linih -lsystemd -lxxhash -lgpiod -lm
 LIBS_CAMERA = -lgphoto2 -lgphoto2_port -ljansson -lxxhash -lm
 TESTS := $(basename $(notdir $(wildcard tests/test_*.c))) check_kernels
 FUZZERS := $(patsubst fuzz_%,%,$(basename $(notdir $(wildcard tests/fuzz/fuzz_*.c))))
@@ -106,9 +106,9 @@ $(BUILD)/tests/%: $(BUILD)/obj/tests/%.o $(BUILD)/librigsim.a $(BUILD)/librig.a 
 	$(Q)$(CC) $(CFLAGS_ALL) -Wl,--as-needed $^ -lcmocka $(LIBS_RIG) $(LIBS) -o $@
 $(BUILD)/tests/test_camera_worker $(BUILD)/tests/test_config $(BUILD)/tests/test_rigsim_wire: | $(BUILD)/bin/rigd-camera $(BUILD)/bin/rigsim
 $(BUILD)/tests/bench/stability_joint: $(call object,solver/commands/arguments.c)
-$(BUILD)/obj/tests/test_usb_camera.o $(BUILD)/obj/tests/usb/usb_camera.o: CFLAGS_ALL += $(shell pkg-config --cflags umockdev-1.0 2>/dev/null)
-$(BUILD)/tests/test_usb_camera: LIBS += $(shell pkg-config --libs umockdev-1.0 2>/dev/null)
-$(BUILD)/tests/test_usb_camera: | $(BUILD)/bin/rigd $(BUILD)/bin/rigd-camera
+$(addprefix $(BUILD)/obj/tests/,test_usb_camera.o test_trigger_usb.o usb/usb_camera.o usb/usbfs.o): CFLAGS_ALL += $(shell pkg-config --cflags umockdev-1.0 2>/dev/null)
+$(BUILD)/tests/test_usb_camera $(BUILD)/tests/test_trigger_usb: LIBS += $(shell pkg-config --libs umockdev-1.0 2>/dev/null)
+$(BUILD)/tests/test_usb_camera $(BUILD)/tests/test_trigger_usb: | $(BUILD)/bin/rigd $(BUILD)/bin/rigd-camera
 $(BUILD)/tests/test_pcg: LIBS += $(if $(wildcard /usr/include/suitesparse/cholmod.h),-lcholmod)
 $(BUILD)/fuzz/obj/%.o: %.c Makefile | deps-fuzz
 	@mkdir -p $(@D)
