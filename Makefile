@@ -96,7 +96,7 @@ $(BUILD)/bin/rigsim: $(call object,$(filter-out %/client.c,$(RIGSIM))) $(BUILD)/
 	@mkdir -p $(@D)
 	@$(if $(V),,echo '  LD $@')
 	$(Q)$(CC) $(CFLAGS_ALL) $^ $(LIBS) -o $@
-$(BUILD)/librigsim.a: $(call object,$(RIGSIM_LIB) tests/rigsim/client.c $(wildcard tests/usb/*.c))
+$(BUILD)/librigsim.a: $(call object,$(RIGSIM_LIB) tests/rigsim/client.c $(wildcard tests/usb/*.c tests/board/*.c))
 	@rm -f $@
 	@$(if $(V),,echo '  AR $@')
 	$(Q)ar rcsD $@ $^
@@ -106,7 +106,7 @@ $(BUILD)/tests/%: $(BUILD)/obj/tests/%.o $(BUILD)/librigsim.a $(BUILD)/librig.a 
 	$(Q)$(CC) $(CFLAGS_ALL) -Wl,--as-needed $^ -lcmocka $(LIBS_RIG) $(LIBS) -o $@
 $(BUILD)/tests/test_camera_worker $(BUILD)/tests/test_config $(BUILD)/tests/test_rigsim_wire: | $(BUILD)/bin/rigd-camera $(BUILD)/bin/rigsim
 $(BUILD)/tests/bench/stability_joint: $(call object,solver/commands/arguments.c)
-$(addprefix $(BUILD)/obj/tests/,test_usb_camera.o test_trigger_usb.o usb/usb_camera.o usb/usbfs.o): CFLAGS_ALL += $(shell pkg-config --cflags umockdev-1.0 2>/dev/null)
+$(addprefix $(BUILD)/obj/tests/,test_usb_camera.o test_trigger_usb.o usb/usb_camera.o usb/usbfs.o board/fake_board.o): CFLAGS_ALL += $(shell pkg-config --cflags umockdev-1.0 2>/dev/null)
 $(BUILD)/tests/test_usb_camera $(BUILD)/tests/test_trigger_usb: LIBS += $(shell pkg-config --libs umockdev-1.0 2>/dev/null)
 $(BUILD)/tests/test_usb_camera $(BUILD)/tests/test_trigger_usb: | $(BUILD)/bin/rigd $(BUILD)/bin/rigd-camera
 $(BUILD)/tests/test_pcg: LIBS += $(if $(wildcard /usr/include/suitesparse/cholmod.h),-lcholmod)

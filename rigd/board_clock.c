@@ -5,6 +5,8 @@
 #include <math.h>
 #include <string.h>
 
+#define DAY_NS INT64_C(86400000000000)
+
 void board_clock_init(struct board_clock *c, double ticks_per_s)
 {
     memset(c, 0, sizeof(*c));
@@ -97,14 +99,26 @@ static void fit(const struct board_clock *c, struct polygon *p, int64_t ticks, i
     }
 }
 
+// It contradicts what is known. Several in a row are the truth.
+static bool doubt(struct board_clock *c, int64_t sent_ns, int64_t received_ns, int64_t ticks)
+{
+    if (++c->n_lies >= BOARD_CLOCK_LIES_MAX) {
+        board_clock_init(c, c->ticks_per_s);
+        board_clock_add(c, sent_ns, received_ns, ticks);
+    }
+    return false;
+}
+
 bool board_clock_add(struct board_clock *c, int64_t sent_ns, int64_t received_ns, int64_t ticks)
 {
     struct polygon p;
-    const struct board_clock before = *c;
     if (received_ns < sent_ns || received_ns - sent_ns > INT64_C(60000000000))
         return false;
-    if (c->n && fabs((double)ticks - (double)c->ticks) > c->ticks_per_s * 86400) // nothing was heard for a day
-        c->n = c->next = 0;
+    if (c->n && sent_ns - c->ns > DAY_NS) // what was known then is worth nothing now
+        board_clock_init(c, c->ticks_per_s);
+    if (c->n && fabs((double)ticks - (double)c->ticks) > 2e-9 * (double)DAY_NS * c->ticks_per_s)
+        return doubt(c, sent_ns, received_ns, ticks);
+    const struct board_clock before = *c;
     c->round[c->next].sent_ns = sent_ns;
     c->round[c->next].received_ns = received_ns;
     c->round[c->next].ticks = ticks;
@@ -112,14 +126,8 @@ bool board_clock_add(struct board_clock *c, int64_t sent_ns, int64_t received_ns
     c->n += c->n < BOARD_CLOCK_ROUNDS;
     fit(c, &p, ticks, sent_ns);
     if (!p.n) {
-        const int n_lies = before.n_lies + 1;
         *c = before;
-        c->n_lies = n_lies;
-        if (n_lies >= BOARD_CLOCK_LIES_MAX) {
-            board_clock_init(c, before.ticks_per_s);
-            board_clock_add(c, sent_ns, received_ns, ticks);
-        }
-        return false;
+        return doubt(c, sent_ns, received_ns, ticks);
     }
     const struct corner middle = centroid(&p);
     c->n_lies = 0;

@@ -494,7 +494,8 @@ static int open_the_trigger(sd_event_source *source, uint64_t usec, void *arg)
     struct daemon *d = arg;
     static const char *const kinds[] = { "software (unsynchronised)", "gpio", "usb", "simulated" };
     (void)usec;
-    d->host = (struct trigger_host){ on_fired, on_feedback, on_button, on_press_camera, on_trigger_broken, d };
+    d->host = (struct trigger_host){ .fired = on_fired, .feedback = on_feedback, .button = on_button, .press_camera = on_press_camera,
+                                      .broken = on_trigger_broken, .arg = d };
     d->trigger_io = sd_event_source_disable_unref(d->trigger_io);
     trigger_close(d->trigger);
     d->trigger = NULL;

@@ -133,5 +133,6 @@ static int trigger_simulated_open(void **self, const struct config *config, cons
     return trigger_lines_open((struct trigger_lines **)self, config, host, &simulated_lines, true);
 }
 
-const struct trigger_ops trigger_simulated = { trigger_simulated_open, trigger_lines_abilities, trigger_lines_fire,
-    trigger_lines_release, trigger_lines_relay, trigger_lines_fd, trigger_lines_dispatch, trigger_lines_close };
+const struct trigger_ops trigger_simulated = { .open = trigger_simulated_open, .abilities = trigger_lines_abilities,
+    .fire = trigger_lines_fire, .release = trigger_lines_release, .relay = trigger_lines_relay, .fd = trigger_lines_fd,
+    .dispatch = trigger_lines_dispatch, .close = trigger_lines_close };

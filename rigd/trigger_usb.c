@@ -40,8 +40,8 @@ enum {
 struct talk { // a command under way
     struct libusb_transfer *out;
     uint8_t bytes[PROTO_FRAME_MAX];
-    bool flies, waits; // on its way; for its answer
-    uint8_t sequence, type;
+    bool asked, flies, waits; // by the loop, to be sent; on its way; for its answer
+    uint8_t sequence, type, n_payload;
     int64_t since_ns;
     struct board_said answer;
 };
@@ -271,16 +271,14 @@ static void LIBUSB_CALL on_time(struct libusb_transfer *t)
     pthread_mutex_unlock(&b->lock);
 }
 
-// ---- what is said to the board: under the lock -----------------------------------------------------------------------------------------
+// ---- what is said to the board: the thread, under the lock ------------------------------------------------------------------------------
 
-static void say(struct board *b, struct talk *k, uint8_t type, const uint8_t *payload, int n)
+static void say(struct board *b, struct talk *k)
 {
+    k->asked = false;
     k->sequence = ++b->sequence;
-    k->type = type;
     k->since_ns = clock_ns();
-    if (n)
-        memcpy(k->bytes + PROTO_HEADER_BYTES, payload, (size_t)n);
-    k->out->length = proto_seal(k->bytes, type, k->sequence, (uint8_t)n);
+    k->out->length = proto_seal(k->bytes, k->type, k->sequence, k->n_payload);
     const int err = libusb_submit_transfer(k->out);
     k->flies = k->waits = !err;
     if (err)
@@ -305,10 +303,12 @@ static void keep_up(struct board *b)
         fail(b, "it does not answer any more: unplug it and plug it in again");
     if (now_ns > b->report_ns)
         fail(b, "it did not report the shot");
+    if (!b->broken && b->command.asked)
+        say(b, &b->command);
     if (b->broken)
         return;
     if (b->session && !b->ping.waits && !b->ping.flies && now_ns - b->ping.since_ns >= PING_MS * MS)
-        say(b, &b->ping, PROTO_PING, NULL, 0);
+        say(b, &b->ping);
     if (!b->times && now_ns >= b->time_next_ns)
         ask_time(b, now_ns);
 }
@@ -348,11 +348,19 @@ static int ask(struct board *b, uint8_t type, const uint8_t *payload, int n, str
     const struct timespec until = real_time_in(ANSWER_MS * MS);
     while (!b->broken && b->command.flies && !pthread_cond_timedwait(&b->changed, &b->lock, &until))
         ;
-    if (!b->broken && !b->command.flies)
-        say(b, &b->command, type, payload, n);
-    while (!b->broken && b->command.waits && !pthread_cond_timedwait(&b->changed, &b->lock, &until))
+    if (b->command.flies)
+        fail(b, "it does not take commands: unplug it and plug it in again");
+    if (!b->broken) {
+        b->command.type = type;
+        b->command.n_payload = (uint8_t)n;
+        if (n)
+            memcpy(b->command.bytes + PROTO_HEADER_BYTES, payload, (size_t)n);
+        b->command.asked = true;
+        libusb_interrupt_event_handler(b->context);
+    }
+    while (!b->broken && (b->command.asked || b->command.waits) && !pthread_cond_timedwait(&b->changed, &b->lock, &until))
         ;
-    if (b->command.waits || b->command.flies)
+    if (b->command.asked || b->command.waits)
         fail(b, "it does not answer: unplug it and plug it in again");
     const int result = b->broken ? -EIO : b->command.answer.reply.error;
     if (answer)
@@ -904,6 +912,7 @@ static int usb_open(void **self, const struct config *config, const struct trigg
     b->report_ns = INT64_MAX;
     b->sequence = (uint8_t)clock_ns(); // not the one of an earlier conversation, whose rest may still come
     b->seed = (unsigned)clock_ns();
+    b->ping.type = PROTO_PING;
     pthread_condattr_init(&monotonic);
     pthread_condattr_setclock(&monotonic, CLOCK_MONOTONIC);
     pthread_cond_init(&b->changed, &monotonic);

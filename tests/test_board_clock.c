@@ -200,7 +200,8 @@ static void what_cannot_be_is_refused(void **state)
     assert_false(board_clock_add(&c, 0, 61 * S, 0));
     assert_false(board_clock_is_known(&c));
     assert_true(board_clock_add(&c, 5 * S, 5 * S + 1000, INT64_MAX / 2));
-    assert_true(board_clock_add(&c, 6 * S, 6 * S + 1000, INT64_MIN / 2)); // another board, a day later
+    assert_false(board_clock_add(&c, 6 * S, 6 * S + 1000, INT64_MIN / 2));
+    assert_true(board_clock_add(&c, 90000 * S, 90000 * S + 1000, 7)); // what was known a day ago contradicts nothing
     assert_true(board_clock_is_known(&c));
 }
 
