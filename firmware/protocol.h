@@ -22,8 +22,9 @@
 // command carries the one before plus 1 (mod 256), else it is answered PROTO_ERR_SEQUENCE and not executed. Each intact command is
 // answered once, in order: type | PROTO_REPLY, same sequence, first byte of payload an enum proto_error, then what is written below
 // (only when that is PROTO_OK). One command at a time is enough; up to two may be under way.
-// A session ends - everything released, shot forgotten, head stopped - by silence (no executed command for silence_ms; a refused
-// one does not count, PING does), USB reset, suspend or unplugging, watchdog, RELEASE by control request does not end it.
+// A session ends - everything released, outputs disabled, shot forgotten, head stopped - by silence (no command in sequence for
+// silence_ms, refused or not; PING is for that), USB reset, suspend, unplugging, the watchdog, and the next HELLO.
+// After opening the device the host may still read frames from before: skip to the answer of its HELLO.
 // Events come in between, with a sequence of their own (counting from 0 after HELLO): a hole says how many were lost.
 #pragma once
 #include <stdbool.h>
@@ -67,11 +68,12 @@ enum {
     PROTO_CHANNEL_OUTPUTS = 256,   // they are among the outputs 0 to 255
     PROTO_INPUTS_MAX = 200,        // 25 shift registers of flash-sync contacts
     PROTO_BANKS_MAX = 4,
+    PROTO_MAX_ON_FLOOR_MS = 200,
     PROTO_MAX_ON_CEILING_MS = 16000,
     PROTO_GUARD_MS = 64,           // how often an output's on-time is looked at
     // What may be asked of an output is this much less than its bank's max_on_ms, so that the guard never cuts what was granted
     // and yet no output is on for longer than max_on_ms.
-    PROTO_ON_SLACK_MS = 2 * PROTO_GUARD_MS + 2,
+    PROTO_ON_SLACK_MS = 2 * PROTO_GUARD_MS + 4,
     PROTO_SILENCE_MIN_MS = 100,
     PROTO_SILENCE_MAX_MS = 10000,
     PROTO_DEBOUNCE_MAX_MS = 1000,
@@ -95,8 +97,8 @@ enum proto_error {
     PROTO_ERR_INCOMPLETE = 9, // COMMIT: not every channel was sent, or nothing would be pressed; or no shot was begun, or another
     PROTO_ERR_ORDER = 10,     // CHANNELS: delays must not fall; then 1 u8 the first wrong entry
     PROTO_ERR_GAP = 11,       // COMMIT: two edges are closer than the board can shift; then 1 u8 the entry that comes too early
-    PROTO_ERR_ON_TIME = 12,   // COMMIT: an output would be on for too long; then 1 u16 the output
-    PROTO_ERR_OUTPUT = 13,    // an output in no bank, beyond the registers, or in a shot twice; then 1 u16 the output
+    PROTO_ERR_ON_TIME = 12,   // COMMIT: outputs would be on for too long; then 1 u8 the bank whose limit it is
+    PROTO_ERR_OUTPUT = 13,    // TOGETHER, CHANNELS, OUTPUT: in no bank, or in the shot twice; then 1 u16 the output
     PROTO_ERR_CONFIGURE = 14, // CONFIGURE first (or HEAD_CONFIGURE)
     PROTO_ERR_NOT_HOMED = 15, // HEAD_MOVE
     PROTO_ERR_LIMIT = 16,     // HEAD_MOVE: beyond the axis' limits
@@ -190,7 +192,7 @@ enum proto_event {
     // The capture input: 0 u64 tick of the edge, exact   8 u16 edges lost since the last
     PROTO_CAPTURE = PROTO_EVENT + 3,
     // Inputs that closed: 0 u64 tick of the sample (it closed within input_sample_ticks before)   then per register: u8 register,
-    // u8 bits. Sampled from the first edge of a shot until feedback_ms after its last release; the first closing of each only.
+    // u8 bits. Sampled from the first edge of a shot until feedback_ms after its last release, at most 8 s; first closings only.
     PROTO_INPUTS = PROTO_EVENT + 4,
     // 0 u8 enum proto_fault   1 u8 0   2 u16 output or frames   4 u64 tick
     PROTO_FAULT = PROTO_EVENT + 5,

@@ -1,0 +1,24 @@
+// firmware/feedback.h - when the flash-sync contacts closed: first closings of sampled inputs, and the stamps of one captured pin.
+//
+// Written in interrupts, read in the main loop. What the host does not read in time is counted, not kept.
+#pragma once
+#include "firmware/protocol.h"
+
+enum { FEEDBACK_REGISTERS = PROTO_INPUTS_MAX / 8, FEEDBACK_SAMPLES_MAX = 64000 }; // 8 s of samples
+
+struct feedback_closing {
+    uint16_t sample; // since the first, one a beat
+    uint8_t input_register, bits;
+};
+
+void feedback_configure(uint8_t n_registers, bool active_high, uint16_t after_ms);
+void feedback_start(void); // forget everything
+// Main loop. *at: tick of the sample. False: none.
+bool feedback_peek(struct feedback_closing *out, uint64_t *at);
+void feedback_drop(void); // the one peeked at
+uint16_t feedback_take_lost(void);
+bool feedback_take_capture(uint64_t *at, uint16_t *n_lost);
+
+// From interrupts.
+void feedback_beat(void); // each 125 us
+void feedback_capture(uint64_t at);
