@@ -13,7 +13,7 @@
 enum {
     BOARD_CLOCK_ROUNDS = 512,        // the latest so many count
     BOARD_CLOCK_CORNERS_MAX = 2 * BOARD_CLOCK_ROUNDS + 4,
-    BOARD_CLOCK_DRIFT_MAX_PPM = 6000, // a ceramic resonator's; beyond is a broken board
+    BOARD_CLOCK_DRIFT_MAX_PPM = 2500, // USB allows a full-speed device no more; crystals stay below 100
     BOARD_CLOCK_WANDER_NS = 50,    // drift changes by at most so many nanoseconds per second, each second (warming up)
     BOARD_CLOCK_LIES_MAX = 4,      // so many round trips in a row that contradict: the counter was set anew, all before is forgotten
 };
