@@ -10,7 +10,7 @@
 #include <time.h>
 #include <unistd.h>
 
-enum { PACE_US = 250, CHUNK = SIMAVR_HZ / 4000, BURST = 40 * CHUNK, EDGES_MAX = 4096, CHANGES_MAX = 64 };
+enum { PACE_US = 250, CHUNK = SIMAVR_HZ / 4000, BURST = 40 * CHUNK, EDGES_MAX = 4096, CHANGES_MAX = 1024 };
 
 struct change {
     enum live_what what;

@@ -23,7 +23,7 @@ extern const struct usbfs_ops live_board_ops;
 // As the kernel shows them: read from the image by control transfers, device and configuration. Length.
 size_t live_board_descriptors(struct live_board *l, uint8_t *to, size_t room, char serial[40]);
 
-// A hand, or a flash-sync contact: now, or at at_ns, at most 64 waiting.
+// A hand, or a flash-sync contact: now, or at at_ns, at most 1024 waiting.
 enum live_what { LIVE_BUTTON, LIVE_CAPTURE, LIVE_INPUT };
 void live_board_set(struct live_board *l, enum live_what what, int input, bool closed, int64_t at_ns);
 // What was latched since the last call: at most max, the oldest first.
