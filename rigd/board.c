@@ -208,10 +208,10 @@ int board_shot_plan(struct board_shot *out, struct edges *e, const struct proto_
     for (int i = 0; i < n; i++)
         asked[i].ticks -= first_ticks;
     qsort(asked, (size_t)n, sizeof(asked[0]), by_time);
-    for (int n_most = 1, assumed = 0; n_most > assumed;) { // more on one edge need more time before it
-        assumed = n_most;
-        n_most = space_out(press, asked, n, board->gap_base_ticks + (int64_t)board->gap_register_ticks * n_registers + (int64_t)board->gap_channel_ticks * assumed);
-    }
+    const int64_t least_gap_ticks = board->gap_base_ticks + (int64_t)board->gap_register_ticks * n_registers;
+    for (int n_together = 1; n_together <= n; n_together++) // the more share an edge, the more time is needed before it
+        if (space_out(press, asked, n, least_gap_ticks + (int64_t)board->gap_channel_ticks * n_together) <= n_together)
+            break;
     for (int i = 0; i < n; i++) {
         if (press[i].ticks > PROTO_DELAY_MAX_TICKS) {
             log_error("trigger: a delay of %.0f ms is longer than the board counts", 1e3 * (double)press[i].ticks / board->ticks_per_s);

@@ -13,7 +13,7 @@
 #include <time.h>
 #include <unistd.h>
 
-enum { URBS_MAX = 64, LOOK_US = 50, LOOKS = 30, // a reap looks so often before it says that there is nothing: a node of umockdev is always ready for poll()
+enum { URBS_MAX = 64, LOOK_US = 50, LOOKS = 4, // a reap looks so often before it says that there is nothing: a node of umockdev is always ready for poll()
        SETUP_BYTES = 8, IN = 0x80 };
 
 struct urb {
