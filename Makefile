@@ -161,7 +161,7 @@ deps-bench: deps ; $(call install_packages,$(PACKAGES_BENCH))
 # ---- tests ----------------------------------------------------------------------------------------------------------------
 TEST_PROGRAMS := $(addprefix $(BUILD)/tests/,$(TESTS))
 TEST_SCRIPTS := $(wildcard tests/check_*.sh tests/test_*.sh)
-test: deps all $(TEST_PROGRAMS)
+test: deps all $(TEST_PROGRAMS) $(BUILD)/tests/board/boardsim
 	@CMOCKA_MESSAGE_OUTPUT=TAP BIN=$(BUILD)/bin prove -j $(shell nproc) --timer --merge --exec '' $(TEST_PROGRAMS) $(TEST_SCRIPTS)
 test-vm: deps $(BUILD)/tests/vm/test_gpio_vm
 	@prove --timer --verbose --exec '' tests/vm/run.sh :: $(BUILD)/vm $(BUILD)/tests/vm/test_gpio_vm
