@@ -5,8 +5,8 @@
 //   PB4  input load, low          PB0  LED, low       PF5          motor drivers' enable, low
 //   PC6 yaw step   PD7 yaw direction   PF4 yaw home   PF7 pitch step   PF6 pitch direction   PD1 pitch home
 //
-// Timer 1 runs freely at 16 MHz: the clock, the latch by compare A, the capture. Timer 0 is the beat, timer 3 the head's.
-// Between edges compare A also calls sequencer_work(): the latch pin is connected to it only while an edge is armed.
+// Timer 1 runs freely at 16 MHz: the clock, the latch by compare A, the capture. Timer 0 is the beat, and its compare B calls
+// sequencer_work(): its vector comes after all others that matter, so they get their turn between two pieces. Timer 3 is the head's.
 // Timer 1's overflows are counted in an interrupt; a reader sees one that was not counted yet by its flag.
 #include "firmware/board.h"
 #include "firmware/head.h"
@@ -44,7 +44,6 @@ enum {
 enum {
     NEAR_TICKS = 120,   // an edge nearer than this cannot be armed safely
     WINDOW_TICKS = 49152, // armed when nearer than this: before the compare register comes round again
-    SOON_TICKS = 64,    // what other interrupts get between two pieces of work
 };
 enum { LATCH_NONE, LATCH_FAR, LATCH_ARMED };
 
@@ -169,8 +168,9 @@ ISR(TIMER1_OVF_vect)
 // ---- outputs ----------------------------------------------------------------------------------------------------------------------------
 void board_shift(const uint8_t *registers, uint8_t n)
 {
-    while (n-- > 0) {
-        SPDR = registers[n];
+    for (const uint8_t *p = registers + n; p > registers;) {
+        const uint8_t byte = *--p;
+        SPDR = byte;
         while (!(SPSR & 1 << SPIF)) // 16 cycles
             ;
     }
@@ -229,23 +229,28 @@ bool board_latch_cancel(void)
     return true;
 }
 
-void board_work_soon(void)
-{
-    OCR1A = (uint16_t)(TCNT1 + SOON_TICKS);
-    TIFR1 = 1 << OCF1A;
-    TIMSK1 |= 1 << OCIE1A;
-}
-
 ISR(TIMER1_COMPA_vect)
 {
     TIMSK1 &= (uint8_t)~(1 << OCIE1A);
-    if (latch != LATCH_ARMED) {
-        sequencer_work();
-        return;
-    }
+    if (latch != LATCH_ARMED)
+        return; // cancelled while this was on its way
     disconnect();
     latch = LATCH_NONE;
     sequencer_latched();
+}
+
+void board_work_soon(void) // 8 to 24 ticks
+{
+    const uint8_t at = (uint8_t)(TCNT0 + 2);
+    OCR0B = at > OCR0A ? (uint8_t)(at - OCR0A - 1) : at;
+    TIFR0 = 1 << OCF0B;
+    TIMSK0 |= 1 << OCIE0B;
+}
+
+ISR(TIMER0_COMPB_vect)
+{
+    TIMSK0 &= (uint8_t)~(1 << OCIE0B);
+    sequencer_work();
 }
 
 void board_enable(bool on)
@@ -261,9 +266,15 @@ void board_sample(uint8_t *inputs, uint8_t n_inputs, const uint8_t *outputs, uin
 {
     PORTB &= (uint8_t)~LOAD;
     PORTB |= LOAD;
-    uint8_t n = n_inputs > n_outputs ? n_inputs : n_outputs;
-    while (n-- > 0) {
-        SPDR = n < n_outputs ? outputs[n] : 0;
+    for (; n_inputs > n_outputs; n_inputs--) { // inputs that come before the outputs must begin
+        SPDR = 0;
+        while (!(SPSR & 1 << SPIF))
+            ;
+        *inputs++ = SPDR;
+    }
+    for (const uint8_t *p = outputs + n_outputs; p > outputs;) {
+        const uint8_t byte = *--p;
+        SPDR = byte;
         while (!(SPSR & 1 << SPIF))
             ;
         const uint8_t in = SPDR;

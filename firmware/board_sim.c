@@ -291,8 +291,8 @@ static void interrupt(void)
         sequencer_latched();
     } else if (b.work <= b.now) {
         b.work = NEVER;
+        advance(b.now + board_sim.cost_work); // it asks for more when it has done its piece: others come in between
         sequencer_work();
-        advance(b.now + board_sim.cost_work);
     } else if (b.beat <= b.now) {
         b.beat += BOARD_TICKS_PER_BEAT;
         session_beat();

@@ -8,7 +8,7 @@ void button_start(struct button *b, uint16_t debounce_ms, bool pressed)
 
 void button_edge(struct button *b, uint64_t now)
 {
-    b->back_ms = 0;
+    b->back_ms = b->stable_ms = 0; // also a bounce between two looks
     if (b->has_first)
         return;
     b->has_first = true;

@@ -12,7 +12,8 @@ enum { CLOSINGS = 48, CAPTURES = 4 }; // powers of two are not needed: indices w
 
 static struct {
     uint8_t n_registers;
-    bool active_high, sampling;
+    bool active_high, sampling, sampled, odd;
+    uint8_t input[FEEDBACK_REGISTERS]; // the last sample, where `sampled`
     uint32_t after_samples, left; // left: samples after the shot's end
     uint16_t run, sample, n_lost;
     uint64_t first;               // tick of sample 0
@@ -29,8 +30,8 @@ void feedback_configure(uint8_t n_registers, bool active_high, uint16_t after_ms
     const uint8_t lock = board_lock();
     f.n_registers = n_registers;
     f.active_high = active_high;
-    f.after_samples = (uint32_t)after_ms * BOARD_BEATS_PER_MS;
-    f.sampling = false;
+    f.after_samples = (uint32_t)after_ms * BOARD_BEATS_PER_MS / 2;
+    f.sampling = f.sampled = false;
     board_unlock(lock);
 }
 
@@ -41,44 +42,67 @@ void feedback_start(void)
     board_unlock(lock);
 }
 
+static void add(uint8_t input_register, uint8_t bits)
+{
+    if (f.n == CLOSINGS) {
+        f.n_lost++;
+        return;
+    }
+    uint8_t i = (uint8_t)(f.head + f.n);
+    if (i >= CLOSINGS)
+        i = (uint8_t)(i - CLOSINGS);
+    f.closing[i] = (struct feedback_closing){ f.sample, input_register, bits };
+    f.n++;
+}
+
+static void look(void)
+{
+    const uint8_t invert = f.active_high ? 0 : 0xFF, old = f.sample == 0 ? 0xFF : 0;
+    uint8_t *seen = f.seen;
+    const uint8_t *input = f.input;
+    for (uint8_t r = 0; r < f.n_registers; r++) {
+        const uint8_t closed = *input++ ^ invert, fresh = closed & (uint8_t)~(*seen | old);
+        if (old)
+            *seen = 0;
+        *seen++ |= closed;
+        if (fresh)
+            add(r, fresh);
+    }
+}
+
 void feedback_beat(void)
 {
     uint16_t run;
+    if (f.sampled) { // in the beat between two samples
+        f.sampled = false;
+        look();
+        f.sample++;
+        return;
+    }
     const bool running = sequencer_sampling(&run);
     if (running && (!f.sampling || run != f.run)) {
         f.sampling = f.n_registers > 0;
         f.run = run;
         f.sample = 0;
-        f.first = board_now();
         f.left = f.after_samples;
+        f.odd = false;
     }
     if (!f.sampling)
         return;
+    f.odd = !f.odd;
+    if (!f.odd) { // a sample was due in the beat before, but there was no room for it
+        f.sample += f.sample > 0;
+        return;
+    }
     if (f.sample == FEEDBACK_SAMPLES_MAX || (!running && f.left-- == 0)) {
         f.sampling = false;
         return;
     }
-    uint8_t input[FEEDBACK_REGISTERS];
-    if (sequencer_sample(input, f.n_registers))
-        for (uint8_t r = 0; r < f.n_registers; r++) {
-            const uint8_t closed = f.active_high ? input[r] : (uint8_t)~input[r];
-            const uint8_t fresh = f.sample == 0 ? 0 : closed & (uint8_t)~f.seen[r];
-            f.seen[r] = f.sample == 0 ? closed : f.seen[r] | closed;
-            if (!fresh)
-                continue;
-            if (f.n == CLOSINGS) {
-                f.n_lost++;
-                continue;
-            }
-            uint8_t i = (uint8_t)(f.head + f.n);
-            if (i >= CLOSINGS)
-                i = (uint8_t)(i - CLOSINGS);
-            f.closing[i] = (struct feedback_closing){ f.sample, r, fresh };
-            f.n++;
-        }
-    else if (f.sample == 0)
-        return; // the first sample must be one
-    f.sample++;
+    if (f.sample == 0)
+        f.first = board_now();
+    f.sampled = sequencer_sample(f.input, f.n_registers);
+    if (f.sampled)
+        f.odd = false;
 }
 
 bool feedback_peek(struct feedback_closing *out, uint64_t *at)
@@ -86,7 +110,7 @@ bool feedback_peek(struct feedback_closing *out, uint64_t *at)
     const uint8_t lock = board_lock();
     const bool has = f.n > 0;
     *out = f.closing[f.head];
-    *at = f.first + (uint32_t)out->sample * BOARD_TICKS_PER_BEAT;
+    *at = f.first + (uint32_t)out->sample * FEEDBACK_TICKS;
     board_unlock(lock);
     return has;
 }

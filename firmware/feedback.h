@@ -4,10 +4,14 @@
 #pragma once
 #include "firmware/protocol.h"
 
-enum { FEEDBACK_REGISTERS = PROTO_INPUTS_MAX / 8, FEEDBACK_SAMPLES_MAX = 64000 }; // 8 s of samples
+enum {
+    FEEDBACK_REGISTERS = PROTO_INPUTS_MAX / 8,
+    FEEDBACK_TICKS = 4000,        // two beats: one shifts a sample in, the next looks at it, so that neither interrupt is long
+    FEEDBACK_SAMPLES_MAX = 32000, // 8 s
+};
 
 struct feedback_closing {
-    uint16_t sample; // since the first, one a beat
+    uint16_t sample; // since the first
     uint8_t input_register, bits;
 };
 

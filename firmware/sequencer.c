@@ -10,7 +10,7 @@
 
 #include <string.h>
 
-enum { CHUNK = 16 }; // entries or registers handled per interrupt
+enum { CHUNK = 16, SHIFT_CHUNK = 26 }; // channels, registers handled per interrupt
 
 enum step {
     REST,         // nothing is pending; the chain holds `now`
@@ -21,14 +21,16 @@ enum step {
     SHIFT_CHANGE, // `now` has changed by itself and is on its way
 };
 
-struct channel {
-    uint8_t delay[3], output; // ticks after T0 + lead; ascending
+struct channel { // ascending
+    uint16_t low;  // of the delay: ticks after T0 + lead
+    uint8_t high, output;
 };
 
 static struct {
     // configured
     struct sequencer_bank bank[PROTO_BANKS_MAX];
     uint8_t n_banks, n_registers;
+    uint8_t looks_min; // the fewest looks of the guard that any bank grants
     bool enabled;
     // outputs
     uint8_t now[SEQUENCER_REGISTERS], next[SEQUENCER_REGISTERS], together[SEQUENCER_REGISTERS];
@@ -47,7 +49,9 @@ static struct {
     bool together_on, aborted;
     uint8_t next_pressed, next_released; // with the edge in preparation
     bool next_together_on, press_edge;
+    bool is_next_used;            // it is not the same as `now`
     uint32_t edge;                // when, after T0
+    uint32_t delay;               // of the channels that are pressed, or the longest of those released
     // its report
     bool has_fired;
     struct sequencer_fired fired;
@@ -68,13 +72,12 @@ static uint8_t bank_of(uint16_t output) // s.n_banks: none
 
 static uint32_t delay_of(uint8_t i)
 {
-    return proto_get_u24(s.channel[i].delay);
+    return s.channel[i].low | (uint32_t)s.channel[i].high << 16;
 }
 
 static bool same_delay(uint8_t i, uint8_t k)
 {
-    const uint8_t *a = s.channel[i].delay, *b = s.channel[k].delay;
-    return a[0] == b[0] && a[1] == b[1] && a[2] == b[2];
+    return s.channel[i].low == s.channel[k].low && s.channel[i].high == s.channel[k].high;
 }
 
 static uint32_t gap(uint8_t n_channels)
@@ -161,7 +164,8 @@ uint8_t sequencer_channels(uint8_t first_entry, const uint8_t *entries, uint8_t 
             *wrong = output;
             return PROTO_ERR_OUTPUT;
         }
-        memcpy(c->delay, entries, 3);
+        c->low = proto_get_u16(entries);
+        c->high = entries[2];
         c->output = output;
         s.banks_channels |= bit_of[bank];
         s.n_loaded++;
@@ -277,8 +281,9 @@ static void end_shot(void)
 // Channels from i to before end that share an edge; if there are many, all of them: it need not be exact, but quick.
 static uint8_t count_edge(uint8_t i, uint8_t end)
 {
+    const struct channel *c = &s.channel[i], *last = &s.channel[end];
     uint8_t n = 1;
-    while (i + n < end && same_delay(i, (uint8_t)(i + n)))
+    for (const struct channel *d = c + 1; d < last && d->low == c->low && d->high == c->high; d++)
         if (++n == CHUNK)
             return (uint8_t)(end - i);
     return n;
@@ -312,13 +317,18 @@ static bool plan(void)
     s.next_released = s.released;
     s.next_together_on = s.together_on;
     s.press_edge = press;
-    if (press && release) {
+    if (press && release && board_is_before(release_at, press_at)) {
         const uint32_t room = gap(count_edge(s.released, s.pressed)) + gap(count_edge(s.pressed, s.n));
         s.press_edge = (int32_t)(press_at - release_at) < (int32_t)room;
     }
     s.edge = s.press_edge ? press_at : release_at;
+    s.delay = s.press_edge ? s.edge - s.lead : s.aborted ? PROTO_DELAY_MAX_TICKS : s.edge - s.lead - s.hold;
+    if (!s.press_edge && s.delay > PROTO_DELAY_MAX_TICKS)
+        s.delay = PROTO_DELAY_MAX_TICKS;
     s.at = s.press_edge ? s.pressed : s.released;
-    memcpy(s.next, s.now, s.n_registers);
+    if (s.is_next_used) // and never came
+        memcpy(s.next, s.now, s.n_registers);
+    s.is_next_used = true;
     s.planned_change = s.change;
     if (s.press_edge && together_due) {
         for (uint8_t r = 0; r < s.n_registers; r++)
@@ -328,25 +338,27 @@ static bool plan(void)
     return true;
 }
 
-// A piece of BUILD; true: done.
+// A piece of BUILD; true: done. This is where a large shot spends its time: 16-bit pointers, no 32-bit sums.
 static bool build(void)
 {
-    uint8_t budget = CHUNK;
+    const struct channel *c = &s.channel[s.at];
+    const struct channel *end = &s.channel[!s.press_edge ? s.pressed : s.delay > PROTO_DELAY_MAX_TICKS ? s.pressed : s.n];
+    const struct channel *stop = (size_t)(end - c) > CHUNK ? c + CHUNK : end;
+    const uint16_t low = (uint16_t)s.delay;
+    const uint8_t high = (uint8_t)(s.delay >> 16);
+    bool more = true;
+    if (s.press_edge)
+        for (; c < stop && (more = c->low == low && c->high == high); c++)
+            s.next[c->output >> 3] |= bit_of[c->output & 7];
+    else
+        for (; c < stop && (more = c->high < high || (c->high == high && c->low <= low)); c++)
+            s.next[c->output >> 3] &= (uint8_t)~bit_of[c->output & 7];
+    s.at = (uint8_t)(c - s.channel);
+    if (more && c < end)
+        return false;
     if (s.press_edge) {
-        while (s.at < s.n && s.lead + delay_of(s.at) == s.edge) {
-            if (budget-- == 0)
-                return false;
-            s.next[s.channel[s.at].output >> 3] |= bit_of[s.channel[s.at].output & 7];
-            s.at++;
-        }
         s.next_pressed = s.at;
         return true;
-    }
-    while (s.at < s.pressed && (s.aborted || !board_is_before(s.edge, s.lead + s.hold + delay_of(s.at)))) {
-        if (budget-- == 0)
-            return false;
-        s.next[s.channel[s.at].output >> 3] &= (uint8_t)~bit_of[s.channel[s.at].output & 7];
-        s.at++;
     }
     s.next_released = s.at;
     if (s.together_on && s.at == s.pressed && (s.aborted || s.at == s.n)) {
@@ -360,7 +372,7 @@ static bool build(void)
 // A piece of SHIFT, the farthest registers first; true: done.
 static bool shift(const uint8_t *image)
 {
-    const uint8_t left = (uint8_t)(s.n_registers - s.at), n = left < CHUNK ? left : CHUNK;
+    const uint8_t left = (uint8_t)(s.n_registers - s.at), n = left < SHIFT_CHUNK ? left : SHIFT_CHUNK;
     board_shift(image + (left - n), n);
     s.at = (uint8_t)(s.at + n);
     return s.at == s.n_registers;
@@ -408,6 +420,7 @@ static void flush_change(void)
 static void latched(uint32_t late)
 {
     memcpy(s.now, s.next, s.n_registers); // what changed since `next` was made, it did in both
+    s.is_next_used = false;
     if (s.press_edge && s.pressed == 0 && (s.next_pressed > 0 || s.n == 0))
         s.fired.tick = s.t0 + s.edge + late;
     if (s.press_edge && late > s.fired.late_ticks)
@@ -462,9 +475,11 @@ void sequencer_work(void)
             flush_change();
             return;
         }
-        late = ticks_since_t0() - s.edge; // or too near to be armed: "negative", and latched at once
-        if ((int32_t)late < 0)
-            late = 0;
+        late = ticks_since_t0() - s.edge;
+        if ((int32_t)late < 0) { // too near to be armed: again when it is past, rather late than early
+            s.step = SHIFT;
+            break;
+        }
         if (s.press_edge && late > SEQUENCER_LATE_MAX_TICKS) {
             s.fired.result = PROTO_FIRED_LATE;
             s.aborted = true;
@@ -515,31 +530,38 @@ uint8_t sequencer_output(uint16_t output, bool on)
     return PROTO_OK;
 }
 
-// Each register is looked at every PROTO_GUARD_MS, one in a millisecond. An output that was found on `limit` times has been on for
-// more than (limit - 1) and at most limit * PROTO_GUARD_MS.
+// Looks at which an output of this bank is cut: what was found on n times has been on for more than n - 1 and at most n
+// PROTO_GUARD_MS.
+static uint8_t looks_of(const struct sequencer_bank *bank)
+{
+    return (uint8_t)((bank->max_on_ms - 2) / PROTO_GUARD_MS);
+}
+
+static void guard(uint16_t output)
+{
+    const uint8_t bank = bank_of(output);
+    if (bank < s.n_banks && s.age[output] < looks_of(&s.bank[bank]))
+        return;
+    set_output(output, false);
+    s.n_guarded++;
+    s.has_guarded = true;
+    s.guarded_output = output;
+    s.guarded_tick = board_now();
+}
+
+// Each register is looked at every PROTO_GUARD_MS, one in a millisecond.
 void sequencer_ms(uint8_t ms)
 {
     const uint8_t r = ms % PROTO_GUARD_MS;
     if (r >= s.n_registers)
         return;
     uint8_t *age = &s.age[(uint16_t)r * 8];
-    const uint8_t on = s.now[r];
-    for (uint8_t b = 0; b < 8; b++, age++) {
-        if (!(on & bit_of[b])) {
+    uint8_t on = s.now[r];
+    for (uint8_t b = 0; b < 8; b++, age++, on >>= 1) {
+        if (!(on & 1))
             *age = 0;
-            continue;
-        }
-        const uint16_t output = (uint16_t)(r * 8 + b);
-        const uint8_t bank = bank_of(output);
-        if (*age < UINT8_MAX)
-            ++*age;
-        if (bank < s.n_banks && *age < (uint8_t)((s.bank[bank].max_on_ms - 2) / PROTO_GUARD_MS))
-            continue;
-        set_output(output, false);
-        s.n_guarded++;
-        s.has_guarded = true;
-        s.guarded_output = output;
-        s.guarded_tick = board_now();
+        else if (++*age >= s.looks_min) // goes off at 250 at most
+            guard((uint16_t)(age - s.age));
     }
 }
 
@@ -599,6 +621,7 @@ void sequencer_release_all(bool enable)
     s.step = REST;
     memset(s.now, 0, sizeof(s.now));
     memset(s.next, 0, sizeof(s.next));
+    s.is_next_used = false;
     s.planned_change = s.latched_change = s.change;
     board_unlock(lock);
     for (uint8_t r = 0; r < SEQUENCER_REGISTERS; r = (uint8_t)(r + CHUNK)) { // all there may be, whatever is configured
@@ -640,6 +663,10 @@ uint8_t sequencer_configure(uint8_t n_registers, const struct sequencer_bank *ba
     memcpy(s.bank, bank, n_banks * sizeof(*bank));
     s.n_banks = n_banks;
     s.n_registers = n_registers;
+    s.looks_min = UINT8_MAX;
+    for (uint8_t b = 0; b < n_banks; b++)
+        if (looks_of(&bank[b]) < s.looks_min)
+            s.looks_min = looks_of(&bank[b]);
     sequencer_release_all(true);
     return PROTO_OK;
 }

@@ -83,7 +83,7 @@ void session_capabilities(uint8_t out[PROTO_CAPABILITIES_BYTES])
         .gap_channel_ticks = BOARD_GAP_CHANNEL,
         .lead_min_ticks = SEQUENCER_LEAD_MIN_TICKS,
         .late_max_ticks = SEQUENCER_LATE_MAX_TICKS,
-        .input_sample_ticks = BOARD_TICKS_PER_BEAT,
+        .input_sample_ticks = FEEDBACK_TICKS,
         .n_captures = 1,
         .n_axes = PROTO_AXES,
         .steps_per_s_max = PROTO_HEAD_SPEED_MAX,
@@ -194,13 +194,14 @@ static uint8_t configure(const struct command *c)
     return PROTO_OK;
 }
 
-static uint8_t with_u16(struct command *c, uint8_t err, uint16_t wrong)
+// What an error is about goes with it.
+static uint8_t explain(struct command *c, uint8_t err, const uint16_t *wrong)
 {
     if (err == PROTO_ERR_OUTPUT) {
-        proto_put_u16(c->out, wrong);
+        proto_put_u16(c->out, *wrong);
         c->n_out = 2;
     } else if (err == PROTO_ERR_ORDER || err == PROTO_ERR_GAP || err == PROTO_ERR_ON_TIME) {
-        c->out[0] = (uint8_t)wrong;
+        c->out[0] = (uint8_t)*wrong;
         c->n_out = 1;
     } else if (err == PROTO_ERR_PAST) {
         proto_put_u64(c->out, board_now());
@@ -260,17 +261,17 @@ static uint8_t execute(uint8_t type, struct command *c)
     case PROTO_SHOT_TOGETHER:
         if (n < 2)
             return PROTO_ERR_LENGTH;
-        return with_u16(c, sequencer_together(in[0], in + 1, (uint8_t)(n - 1), &wrong), wrong);
+        return explain(c, sequencer_together(in[0], in + 1, (uint8_t)(n - 1), &wrong), &wrong);
     case PROTO_SHOT_CHANNELS:
         if (n < 1 + PROTO_CHANNEL_BYTES || (n - 1) % PROTO_CHANNEL_BYTES)
             return PROTO_ERR_LENGTH;
-        return with_u16(c, sequencer_channels(in[0], in + 1, (uint8_t)((n - 1) / PROTO_CHANNEL_BYTES), &wrong), wrong);
+        return explain(c, sequencer_channels(in[0], in + 1, (uint8_t)((n - 1) / PROTO_CHANNEL_BYTES), &wrong), &wrong);
     case PROTO_SHOT_COMMIT:
         if (n != PROTO_SHOT_COMMIT_BYTES)
             return PROTO_ERR_LENGTH;
         if (head_is_moving())
             return PROTO_ERR_BUSY;
-        return with_u16(c, sequencer_commit(proto_get_u16(in), proto_get_u64(in + 2), &wrong), wrong);
+        return explain(c, sequencer_commit(proto_get_u16(in), proto_get_u64(in + 2), &wrong), &wrong);
     case PROTO_RELEASE:
         if (n != 1)
             return PROTO_ERR_LENGTH;
@@ -288,7 +289,8 @@ static uint8_t execute(uint8_t type, struct command *c)
             return PROTO_ERR_LENGTH;
         if (in[2] > 1)
             return PROTO_ERR_VALUE;
-        return with_u16(c, sequencer_output(proto_get_u16(in), in[2]), proto_get_u16(in));
+        wrong = proto_get_u16(in);
+        return explain(c, sequencer_output(wrong, in[2]), &wrong);
     case PROTO_IDENTIFY:
         if (n != 2)
             return PROTO_ERR_LENGTH;
@@ -494,7 +496,12 @@ static void each_ms(void)
     if (e.identify_ms > 0)
         e.identify_ms--;
     board_led(e.identify_ms > 0 ? e.ms & 128 : e.open);
-    if (!e.open || !button_ms(&e.button, button_level(), board_now()))
+    if (!e.open)
+        return;
+    const bool level = button_level();
+    if (level == e.button.pressed && !e.button.has_first) // nothing happens: do not look at the clock
+        return;
+    if (!button_ms(&e.button, level, board_now()))
         return;
     const bool fired = e.button.pressed && sequencer_button(board_now());
     if (e.n_button == BUTTON_EVENTS) {

@@ -35,8 +35,8 @@ const char *__lsan_default_suppressions(void)
 }
 
 enum { // data addresses
-    PINB = 0x23, DDRB = 0x24, PORTB = 0x25, TIFR1 = 0x36, SPCR = 0x4C, SPSR = 0x4D, SPDR = 0x4E, MCUSR = 0x54, UDCON = 0xE0, UDINT = 0xE1,
-    UDIEN = 0xE2, USBINT = 0xDA,
+    PINB = 0x23, DDRB = 0x24, PORTB = 0x25, TIFR0 = 0x35, TIFR1 = 0x36, SPCR = 0x4C, SPSR = 0x4D, SPDR = 0x4E, MCUSR = 0x54, UDCON = 0xE0, UDINT = 0xE1,
+    UDIEN = 0xE2, USBINT = 0xDA, TCCR1A = 0x80,
 };
 enum { SPIF = 0x80, SUSPI = 1, DETACH = 1, LED = 1 << 0, LOAD = 1 << 4, LATCH = 1 << 5, ENABLE = 1 << 6, USB_GEN = 10, N_AXES = 2 };
 enum { CONTROL_TIMEOUT = 50 * (SIMAVR_HZ / 1000), POLL_CYCLES = 160 };
@@ -57,7 +57,9 @@ struct simavr_board {
     bool step_high[N_AXES], direction[N_AXES];
     // interrupts
     uint64_t requested[SIMAVR_VECTORS]; // 0: not
-    uint32_t latency[SIMAVR_VECTORS];
+    uint64_t began[SIMAVR_VECTORS];
+    uint32_t latency[SIMAVR_VECTORS], duration[SIMAVR_VECTORS], margin;
+    uint64_t armed;
     struct vector_hook {
         struct simavr_board *b;
         avr_int_vector_t *vector;
@@ -97,6 +99,8 @@ static void on_latch(avr_irq_t *irq, uint32_t value, void *param)
         const uint64_t match = b->timer1->tov_base + b->timer1->comp[AVR_TIMER_COMPA].comp_cycles;
         const bool by_timer = !(b->portb & LATCH) && match <= b->avr->cycle && b->avr->cycle - match < 64;
         memcpy(b->latched, b->chain, sizeof(b->chain));
+        if (by_timer && match - b->armed < b->margin)
+            b->margin = (uint32_t)(match - b->armed);
         show(b, by_timer ? match : b->avr->cycle);
     }
     b->latch_high = high;
@@ -152,7 +156,7 @@ static uint8_t spi_read(avr_t *avr, avr_io_addr_t addr, void *param)
 }
 
 // ---- repairs, measurement -----------------------------------------------------------------------------------------------------------------
-static void tifr1_write(avr_t *avr, avr_io_addr_t addr, uint8_t value, void *param)
+static void tifr_write(avr_t *avr, avr_io_addr_t addr, uint8_t value, void *param)
 {
     struct simavr_board *b = param;
     for (int i = 0; i < avr->interrupts.vector_count; i++) {
@@ -162,6 +166,13 @@ static void tifr1_write(avr_t *avr, avr_io_addr_t addr, uint8_t value, void *par
             b->requested[v->vector] = 0;
         }
     }
+}
+
+static void tccr1a_write(avr_t *avr, avr_io_addr_t addr, uint8_t value, void *param)
+{
+    (void)addr;
+    if (value >> 6 == 3) // the latch pin rises on the match
+        ((struct simavr_board *)param)->armed = avr->cycle;
 }
 
 static void flags_write(avr_t *avr, avr_io_addr_t addr, uint8_t value, void *param)
@@ -183,6 +194,9 @@ static void on_running(avr_irq_t *irq, uint32_t value, void *param)
     const struct vector_hook *h = param;
     const uint8_t v = h->vector->vector;
     (void)irq;
+    if (!value && h->b->began[v] && h->b->avr->cycle - h->b->began[v] > h->b->duration[v])
+        h->b->duration[v] = (uint32_t)(h->b->avr->cycle - h->b->began[v]);
+    h->b->began[v] = value ? h->b->avr->cycle : 0;
     if (!value || !h->b->requested[v])
         return;
     const uint64_t latency = h->b->avr->cycle - h->b->requested[v];
@@ -268,8 +282,9 @@ static void wire(struct simavr_board *b)
     avr->io[AVR_DATA_TO_IO(SPDR)].w.param = b;
     avr->io[AVR_DATA_TO_IO(SPDR)].r.c = spi_read;
     avr->io[AVR_DATA_TO_IO(SPDR)].r.param = b;
-    avr->io[AVR_DATA_TO_IO(TIFR1)].w.c = tifr1_write;
-    avr->io[AVR_DATA_TO_IO(TIFR1)].w.param = b;
+    avr->io[AVR_DATA_TO_IO(TIFR0)].w.c = avr->io[AVR_DATA_TO_IO(TIFR1)].w.c = tifr_write;
+    avr->io[AVR_DATA_TO_IO(TIFR0)].w.param = avr->io[AVR_DATA_TO_IO(TIFR1)].w.param = b;
+    avr_register_io_write(avr, TCCR1A, tccr1a_write, b);
     avr_register_io_write(avr, UDINT, flags_write, b);
     avr_register_io_write(avr, USBINT, flags_write, b);
     avr_irq_register_notify(pin(b, 'B', 5), on_latch, b);
@@ -329,6 +344,7 @@ struct simavr_board *simavr_board_open(const char *elf, const struct simavr_boar
     free(image.eeprom);
     memset(b->input, 0xFF, sizeof(b->input));
     b->timer1 = find_timer1(b->avr);
+    b->margin = UINT32_MAX;
     wire(b);
     rest_inputs(b);
     b->core_reset = b->avr->reset;
@@ -543,6 +559,18 @@ int simavr_board_enumerate(struct simavr_board *b)
 void simavr_board_clear_latency(struct simavr_board *b)
 {
     memset(b->latency, 0, sizeof(b->latency));
+    memset(b->duration, 0, sizeof(b->duration));
+    b->margin = UINT32_MAX;
+}
+
+const uint32_t *simavr_board_duration(const struct simavr_board *b)
+{
+    return b->duration;
+}
+
+uint32_t simavr_board_margin(const struct simavr_board *b)
+{
+    return b->margin;
 }
 
 const uint32_t *simavr_board_latency(const struct simavr_board *b)
@@ -554,7 +582,7 @@ const char *simavr_board_vector_name(int vector)
 {
     static const char *const name[SIMAVR_VECTORS] = {
         [7] = "INT6 (button)", [10] = "USB_GEN (reset, suspend)", [11] = "USB_COM (SETUP)", [16] = "TIMER1_CAPT (flash sync)",
-        [17] = "TIMER1_COMPA (edge, work)", [20] = "TIMER1_OVF (clock)", [21] = "TIMER0_COMPA (beat)", [32] = "TIMER3_COMPA (head)",
+        [17] = "TIMER1_COMPA (edge)", [20] = "TIMER1_OVF (clock)", [21] = "TIMER0_COMPA (beat)", [22] = "TIMER0_COMPB (work)", [32] = "TIMER3_COMPA (head)",
     };
     return name[vector];
 }

@@ -53,6 +53,9 @@ int simavr_board_enumerate(struct simavr_board *b);
 // ---- measurement ----------------------------------------------------------------------------------------------------------------------
 // The longest time from an interrupt's request to its begin, by vector number, since the start or the last clearing. 0: never ran.
 enum { SIMAVR_VECTORS = 43 };
+const uint32_t *simavr_board_duration(const struct simavr_board *b); // likewise, of the interrupt itself
 void simavr_board_clear_latency(struct simavr_board *b);
 const uint32_t *simavr_board_latency(const struct simavr_board *b);
+// The least time that an edge was armed before it came, since the start or the last clearing: what the firmware has left.
+uint32_t simavr_board_margin(const struct simavr_board *b);
 const char *simavr_board_vector_name(int vector);
