@@ -184,6 +184,15 @@ static void hear_event(struct board *b, const struct board_said *s)
     tell_loop(b);
 }
 
+static void forget_head(struct board *b)
+{
+    int n = 0;
+    for (int i = 0; i < b->n_heard; i++)
+        if (b->heard[i].said.type != PROTO_HEAD)
+            b->heard[n++] = b->heard[i];
+    b->n_heard = n;
+}
+
 static void hear(struct board *b, const uint8_t *bytes, size_t n)
 {
     struct board_said s;
@@ -206,6 +215,8 @@ static void hear(struct board *b, const uint8_t *bytes, size_t n)
             b->session = true;
             b->event_sequence = 0;
         }
+        if (k->type == PROTO_HEAD_MOVE || k->type == PROTO_HEAD_HOME)
+            forget_head(b); // what was said of it before this command began
         if (k == &b->ping && s.reply.error)
             fail(b, "%s", board_error_text(s.reply.error));
         pthread_cond_broadcast(&b->changed);

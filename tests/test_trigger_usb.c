@@ -1,5 +1,6 @@
 // tests/test_trigger_usb.c - the trigger board on USB: the real libusb and trigger_usb.c against a board that lies (fake_board.h), and against the
 // real firmware in simavr, both behind umockdev; then the real rigd.
+#include "firmware/board.h"
 #include "rigd/board_clock.h"
 #include "rigd/trigger.h"
 #include "solver/take/log.h"
@@ -331,7 +332,7 @@ static bool pulse(int line, int64_t *on_ns, int64_t *off_ns)
 
 static int64_t gap_ns(int n_registers, int n_together)
 {
-    return (3000 + 40 * n_registers + 60 * n_together) * INT64_C(125) / 2; // what the firmware's capabilities say
+    return (BOARD_GAP_BASE + BOARD_GAP_REGISTER * n_registers + BOARD_GAP_CHANNEL * n_together) * INT64_C(125) / 2;
 }
 
 static void a_shot_is_one_edge_where_nothing_is_delayed(void **state)
@@ -403,7 +404,7 @@ static void each_channel_keeps_its_delay(void **state)
             first_ns = i ? first_ns : on_ns;
             const int64_t error_ns = on_ns - first_ns - delay_us[i] * INT64_C(1000);
             // Half of what the board needs between edges, and drift that is not known yet.
-            if (llabs(error_ns) > gap_ns(2 * row / 8 + 1, n / 7 + 2) / 2 + 40 * MS * BOARD_CLOCK_DRIFT_MAX_PPM / 1000000)
+            if (llabs(error_ns) > gap_ns(2 * row / 8 + 1, n / 7 + 10) / 2 + 40 * MS * BOARD_CLOCK_DRIFT_MAX_PPM / 1000000)
                 fail_msg("camera %d: %.1f us off", i, 1e-3 * (double)error_ns);
             worst_us = 1e-3 * (double)llabs(error_ns) > worst_us ? 1e-3 * (double)llabs(error_ns) : worst_us;
             assert_true(off_ns - on_ns >= 599 * MS / 10);
