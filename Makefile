@@ -45,6 +45,7 @@ LIBS_CAMERA = -lgphoto2 -lgphoto2_port -ljansson -lxxhash -lm
 FIRMWARE_LOGIC := $(filter-out firmware/main.c firmware/board_%.c,$(wildcard firmware/*.c))
 FIRMWARE_SIM := $(FIRMWARE_LOGIC) firmware/board_sim.c # the same logic on the host
 TESTS := $(basename $(notdir $(wildcard tests/test_*.c))) check_kernels
+BOARD_TESTS := test_trigger_usb test_board_shots test_board_loss
 FUZZERS := $(patsubst fuzz_%,%,$(basename $(notdir $(wildcard tests/fuzz/fuzz_*.c))))
 FUZZED := $(LIBRARY) $(RIG) $(RIGSIM_LIB) $(FIRMWARE_SIM) # what a fuzzer calls of these is linked
 
@@ -109,11 +110,11 @@ $(BUILD)/tests/%: $(BUILD)/obj/tests/%.o $(BUILD)/librigsim.a $(BUILD)/librig.a 
 	$(Q)$(CC) $(CFLAGS_ALL) -Wl,--as-needed $^ -lcmocka $(LIBS_RIG) $(LIBS) -o $@
 $(BUILD)/tests/test_camera_worker $(BUILD)/tests/test_config $(BUILD)/tests/test_rigsim_wire: | $(BUILD)/bin/rigd-camera $(BUILD)/bin/rigsim
 $(BUILD)/tests/bench/stability_joint: $(call object,solver/commands/arguments.c)
-$(addprefix $(BUILD)/obj/tests/,test_usb_camera.o test_trigger_usb.o usb/usb_camera.o usb/usbfs.o board/fake_board.o board/live_board.o board/boardsim.o): CFLAGS_ALL += $(shell pkg-config --cflags umockdev-1.0 2>/dev/null)
-$(BUILD)/tests/test_usb_camera $(BUILD)/tests/test_trigger_usb $(BUILD)/tests/board/boardsim: LIBS += $(shell pkg-config --libs umockdev-1.0 2>/dev/null)
-$(BUILD)/tests/test_trigger_usb $(BUILD)/tests/board/boardsim: LIBS += -lsimavr -lelf
-$(BUILD)/tests/test_trigger_usb $(BUILD)/tests/board/boardsim: | build/firmware/trigger.elf
-$(BUILD)/tests/test_usb_camera $(BUILD)/tests/test_trigger_usb: | $(BUILD)/bin/rigd $(BUILD)/bin/rigd-camera
+$(addprefix $(BUILD)/obj/tests/,test_usb_camera.o $(addsuffix .o,$(BOARD_TESTS)) usb/usb_camera.o usb/usbfs.o board/fake_board.o board/live_board.o board/boardsim.o): CFLAGS_ALL += $(shell pkg-config --cflags umockdev-1.0 2>/dev/null)
+$(BUILD)/tests/test_usb_camera $(addprefix $(BUILD)/tests/,$(BOARD_TESTS)) $(BUILD)/tests/board/boardsim: LIBS += $(shell pkg-config --libs umockdev-1.0 2>/dev/null)
+$(addprefix $(BUILD)/tests/,$(BOARD_TESTS)) $(BUILD)/tests/board/boardsim: LIBS += -lsimavr -lelf
+$(addprefix $(BUILD)/tests/,$(BOARD_TESTS)) $(BUILD)/tests/board/boardsim: | build/firmware/trigger.elf
+$(BUILD)/tests/test_usb_camera $(addprefix $(BUILD)/tests/,$(BOARD_TESTS)): | $(BUILD)/bin/rigd $(BUILD)/bin/rigd-camera
 $(BUILD)/tests/test_pcg: LIBS += $(if $(wildcard /usr/include/suitesparse/cholmod.h),-lcholmod)
 $(BUILD)/tests/test_firmware: $(call object,$(FIRMWARE_SIM))
 $(BUILD)/tests/test_firmware_avr $(BUILD)/tests/bench/bench_firmware: $(call object,tests/board/simavr_board.c)
