@@ -120,10 +120,17 @@ __attribute__((format(printf, 2, 3))) static void fail(struct board *b, const ch
     tell_loop(b);
 }
 
+static const char unplugged[] = "it is unplugged; it has released everything";
+
+static void fail_call(struct board *b, const char *what, int error)
+{
+    fail(b, "%s: %s", what, error == LIBUSB_ERROR_NO_DEVICE ? unplugged : libusb_strerror(error));
+}
+
 static void fail_transfer(struct board *b, const char *what, const struct libusb_transfer *t)
 {
     static const char *const texts[] = { [LIBUSB_TRANSFER_ERROR] = "the link failed; look at cable and hub", [LIBUSB_TRANSFER_TIMED_OUT] = "no answer: it hangs; unplug it and plug it in again",
-        [LIBUSB_TRANSFER_CANCELLED] = "cancelled", [LIBUSB_TRANSFER_STALL] = "it refuses; is this its firmware?", [LIBUSB_TRANSFER_NO_DEVICE] = "it is unplugged; it has released everything",
+        [LIBUSB_TRANSFER_CANCELLED] = "cancelled", [LIBUSB_TRANSFER_STALL] = "it refuses; is this its firmware?", [LIBUSB_TRANSFER_NO_DEVICE] = unplugged,
         [LIBUSB_TRANSFER_OVERFLOW] = "it sends more than it may; is this its firmware?" };
     fail(b, "%s: %s", what, t->status < sizeof(texts) / sizeof(texts[0]) && texts[t->status] ? texts[t->status] : "failed");
 }
@@ -244,7 +251,7 @@ static void LIBUSB_CALL on_read(struct libusb_transfer *t)
         const int err = libusb_submit_transfer(t);
         b->reads[i] = !err;
         if (err)
-            fail(b, "reading: %s", libusb_strerror(err));
+            fail_call(b, "reading", err);
     }
     pthread_mutex_unlock(&b->lock);
 }
@@ -293,7 +300,7 @@ static void say(struct board *b, struct talk *k)
     const int err = libusb_submit_transfer(k->out);
     k->flies = k->waits = !err;
     if (err)
-        fail(b, "a command: %s", libusb_strerror(err));
+        fail_call(b, "a command", err);
 }
 
 static void ask_time(struct board *b, int64_t now_ns)
@@ -304,7 +311,7 @@ static void ask_time(struct board *b, int64_t now_ns)
     const int err = libusb_submit_transfer(b->time);
     b->times = !err;
     if (err)
-        fail(b, "asking for the time: %s", libusb_strerror(err));
+        fail_call(b, "asking for the time", err);
 }
 
 static void keep_up(struct board *b)
@@ -338,7 +345,7 @@ static void *run(void *arg)
         const int err = libusb_handle_events_timeout_completed(b->context, &t, NULL);
         if (err && err != LIBUSB_ERROR_INTERRUPTED) {
             pthread_mutex_lock(&b->lock);
-            fail(b, "%s", libusb_strerror(err));
+            fail_call(b, "waiting", err);
             pthread_mutex_unlock(&b->lock);
             break;
         }
@@ -786,7 +793,7 @@ static int begin_thread(struct board *b)
         const int err = libusb_submit_transfer(b->read[i]);
         b->reads[i] = !err;
         if (err)
-            fail(b, "reading: %s", libusb_strerror(err));
+            fail_call(b, "reading", err);
     }
     pthread_mutex_unlock(&b->lock);
     const int err = -pthread_create(&b->thread, NULL, run, b);
