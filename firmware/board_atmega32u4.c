@@ -87,16 +87,13 @@ void board_start(void)
     SPSR = 1 << SPI2X;
     TCCR1A = 0;
     TCCR1B = 1 << ICNC1 | 1 << CS10; // capture: four equal samples, so 4 ticks late
-    TIMSK1 = 1 << TOIE1 | 1 << ICIE1;
     TCCR0A = 1 << WGM01;
     OCR0A = BOARD_TICKS_PER_BEAT / 8 - 1;
     TCCR0B = 1 << CS01;
-    TIMSK0 = 1 << OCIE0A;
     TCCR3A = 0;
     TCCR3B = 1 << WGM32;
     OCR3A = BOARD_TICKS_PER_S / BOARD_HEAD_HZ - 1;
     EICRB = 1 << ISC60; // both edges
-    EIMSK = 1 << INT6;
 }
 
 uint8_t board_reset_cause(void)
@@ -166,14 +163,24 @@ ISR(TIMER1_OVF_vect)
 }
 
 // ---- outputs ----------------------------------------------------------------------------------------------------------------------------
+static void spi_wait(void) // 16 cycles a byte: what can be done meanwhile is done before
+{
+    while (!(SPSR & 1 << SPIF))
+        ;
+}
+
 void board_shift(const uint8_t *registers, uint8_t n)
 {
-    for (const uint8_t *p = registers + n; p > registers;) {
-        const uint8_t byte = *--p;
-        SPDR = byte;
-        while (!(SPSR & 1 << SPIF)) // 16 cycles
-            ;
+    if (n == 0)
+        return;
+    const uint8_t *p = registers + n - 1;
+    SPDR = *p;
+    while (--n > 0) {
+        const uint8_t next = *--p;
+        spi_wait();
+        SPDR = next;
     }
+    spi_wait();
 }
 
 void board_latch(void)
@@ -268,21 +275,23 @@ void board_sample(uint8_t *inputs, uint8_t n_inputs, const uint8_t *outputs, uin
     PORTB |= LOAD;
     for (; n_inputs > n_outputs; n_inputs--) { // inputs that come before the outputs must begin
         SPDR = 0;
-        while (!(SPSR & 1 << SPIF))
-            ;
+        spi_wait();
         *inputs++ = SPDR;
     }
-    for (const uint8_t *p = outputs + n_outputs; p > outputs;) {
-        const uint8_t byte = *--p;
-        SPDR = byte;
-        while (!(SPSR & 1 << SPIF))
-            ;
-        const uint8_t in = SPDR;
-        if (n_inputs > 0) {
-            *inputs++ = in;
-            n_inputs--;
-        }
+    const uint8_t *p = outputs + n_outputs;
+    SPDR = *--p;
+    uint8_t n = n_inputs;
+    while (n-- > 0) {
+        const uint8_t next = p > outputs ? *--p : 0;
+        spi_wait();
+        *inputs++ = SPDR;
+        if (n > 0 || n_outputs > n_inputs)
+            SPDR = next;
     }
+    if (n_outputs > n_inputs)
+        spi_wait();
+    if (n_outputs > n_inputs + 1)
+        board_shift(outputs, (uint8_t)(n_outputs - n_inputs - 1));
 }
 
 bool board_button_high(void)
@@ -401,6 +410,9 @@ void board_run(void)
     USBCON = 1 << USBE | 1 << OTGPADE | 1 << VBUSTE;
     UDIEN = 1 << EORSTE | 1 << SUSPE;
     UDCON = 0; // full speed, attached
+    TIMSK1 = 1 << TOIE1 | 1 << ICIE1;
+    TIMSK0 = 1 << OCIE0A;
+    EIMSK = 1 << INT6;
     sei();
 }
 

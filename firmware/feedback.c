@@ -8,11 +8,11 @@
 
 #include <string.h>
 
-enum { CLOSINGS = 48, CAPTURES = 4 }; // powers of two are not needed: indices wrap by hand
+enum { CLOSINGS = 56, CAPTURES = 4 }; // powers of two are not needed: indices wrap by hand
 
 static struct {
     uint8_t n_registers;
-    bool active_high, sampling, sampled, odd;
+    bool active_high, sampling, sampled;
     uint8_t input[FEEDBACK_REGISTERS]; // the last sample, where `sampled`
     uint32_t after_samples, left; // left: samples after the shot's end
     uint16_t run, sample, n_lost;
@@ -42,7 +42,7 @@ void feedback_start(void)
     board_unlock(lock);
 }
 
-static void add(uint8_t input_register, uint8_t bits)
+static __attribute__((noinline)) void add(uint8_t input_register, uint8_t bits)
 {
     if (f.n == CLOSINGS) {
         f.n_lost++;
@@ -57,26 +57,29 @@ static void add(uint8_t input_register, uint8_t bits)
 
 static void look(void)
 {
-    const uint8_t invert = f.active_high ? 0 : 0xFF, old = f.sample == 0 ? 0xFF : 0;
-    uint8_t *seen = f.seen;
-    const uint8_t *input = f.input;
-    for (uint8_t r = 0; r < f.n_registers; r++) {
-        const uint8_t closed = *input++ ^ invert, fresh = closed & (uint8_t)~(*seen | old);
-        if (old)
-            *seen = 0;
-        *seen++ |= closed;
-        if (fresh)
-            add(r, fresh);
+    const uint8_t invert = f.active_high ? 0 : 0xFF, n = f.n_registers;
+    if (f.sample == 0) {
+        for (uint8_t r = 0; r < n; r++)
+            f.seen[r] = f.input[r] ^ invert;
+        return;
+    }
+    for (uint8_t r = 0; r < n; r++) {
+        const uint8_t fresh = (f.input[r] ^ invert) & (uint8_t)~f.seen[r];
+        if (!fresh)
+            continue;
+        f.seen[r] |= fresh;
+        add(r, fresh);
     }
 }
 
-void feedback_beat(void)
+void feedback_beat(bool odd)
 {
     uint16_t run;
-    if (f.sampled) { // in the beat between two samples
+    if (!odd) {
+        if (f.sampled)
+            look();
+        f.sample += f.sampled || f.sample > 0; // the first must be one
         f.sampled = false;
-        look();
-        f.sample++;
         return;
     }
     const bool running = sequencer_sampling(&run);
@@ -85,15 +88,11 @@ void feedback_beat(void)
         f.run = run;
         f.sample = 0;
         f.left = f.after_samples;
-        f.odd = false;
+        f.n_lost = (uint16_t)(f.n_lost + f.n); // of the shot before: their samples counted from its begin
+        f.n = 0;
     }
     if (!f.sampling)
         return;
-    f.odd = !f.odd;
-    if (!f.odd) { // a sample was due in the beat before, but there was no room for it
-        f.sample += f.sample > 0;
-        return;
-    }
     if (f.sample == FEEDBACK_SAMPLES_MAX || (!running && f.left-- == 0)) {
         f.sampling = false;
         return;
@@ -101,18 +100,20 @@ void feedback_beat(void)
     if (f.sample == 0)
         f.first = board_now();
     f.sampled = sequencer_sample(f.input, f.n_registers);
-    if (f.sampled)
-        f.odd = false;
 }
 
-bool feedback_peek(struct feedback_closing *out, uint64_t *at)
+bool feedback_peek(struct feedback_closing *out)
 {
     const uint8_t lock = board_lock();
     const bool has = f.n > 0;
     *out = f.closing[f.head];
-    *at = f.first + (uint32_t)out->sample * FEEDBACK_TICKS;
     board_unlock(lock);
     return has;
+}
+
+uint64_t feedback_tick(uint16_t sample)
+{
+    return f.first + (uint32_t)sample * FEEDBACK_TICKS; // the main loop's: it changes only when a shot begins
 }
 
 void feedback_drop(void)

@@ -17,12 +17,13 @@ struct feedback_closing {
 
 void feedback_configure(uint8_t n_registers, bool active_high, uint16_t after_ms);
 void feedback_start(void); // forget everything
-// Main loop. *at: tick of the sample. False: none.
-bool feedback_peek(struct feedback_closing *out, uint64_t *at);
+// Main loop. False: none.
+bool feedback_peek(struct feedback_closing *out);
+uint64_t feedback_tick(uint16_t sample);
 void feedback_drop(void); // the one peeked at
 uint16_t feedback_take_lost(void);
 bool feedback_take_capture(uint64_t *at, uint16_t *n_lost);
 
 // From interrupts.
-void feedback_beat(void); // each 125 us
+void feedback_beat(bool odd); // each 125 us: samples in the odd ones, looks at the sample in the others
 void feedback_capture(uint64_t at);

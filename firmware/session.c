@@ -363,12 +363,12 @@ static bool take_button(struct button_event *out)
 static uint8_t put_inputs(uint8_t *p) // all closings of one sample that fit; 0: none
 {
     struct feedback_closing closing;
-    uint64_t at, first;
-    if (!feedback_peek(&closing, &first))
+    if (!feedback_peek(&closing))
         return 0;
-    proto_put_u64(p, first);
+    const uint16_t sample = closing.sample;
+    proto_put_u64(p, feedback_tick(sample));
     uint8_t n = 8;
-    while (n + 2 <= PROTO_PAYLOAD_MAX && feedback_peek(&closing, &at) && at == first) {
+    while (n + 2 <= PROTO_PAYLOAD_MAX && feedback_peek(&closing) && closing.sample == sample) {
         p[n++] = closing.input_register;
         p[n++] = closing.bits;
         feedback_drop();
@@ -515,11 +515,11 @@ static void each_ms(void)
 
 void session_beat(void)
 {
-    feedback_beat();
-    if (++e.beat < BOARD_BEATS_PER_MS)
-        return;
-    e.beat = 0;
-    each_ms();
+    feedback_beat(e.beat & 1);
+    if (e.beat == 0) // not one in which inputs are sampled: that takes long
+        each_ms();
+    if (++e.beat == BOARD_BEATS_PER_MS)
+        e.beat = 0;
 }
 
 void session_button_edge(uint64_t now)

@@ -10,7 +10,7 @@
 #include <stdlib.h>
 #include <string.h>
 
-enum { STREAM_NOISE = 0x6e6f69, NORMALS = 4096, JPEG_WIDTH = 640, THUMB_WIDTH = 160, FOCAL_MM = 50 };
+enum { STREAM_NOISE = 0x6e6f69, STREAM_GAIN = 0x6761696e, NORMALS = 4096, JPEG_WIDTH = 640, THUMB_WIDTH = 160, FOCAL_MM = 50 };
 
 _Static_assert(__BYTE_ORDER__ == __ORDER_LITTLE_ENDIAN__, "rows go into the file as they lie in memory");
 
@@ -20,6 +20,7 @@ struct frame {
     struct raw_dng dng;      // raw
     struct dataset jpeg;     // JPEG
     uint64_t noise_seed;     // of this shot
+    struct scene_view view;
     float electrons[3];      // per scene value 1: R, G, B
     float dn_per_electron, read_variance;
     float black, white;
@@ -53,7 +54,7 @@ static void make_row(struct frame *f, int y)
     const int width = scene_width(f->scene);
     const float k[2] = { f->electrons[y & 1], f->electrons[1 + (y & 1)] };
     const uint64_t row_seed = random_u64(f->noise_seed, STREAM_NOISE, (uint64_t)y);
-    scene_row(f->scene, f->camera, y, f->site);
+    scene_row(f->scene, f->camera, &f->view, y, f->site);
     for (int x = 0; x < width; x += 4) {
         const uint64_t bits = random_mix(row_seed + (uint64_t)x);
         for (int i = 0; i < 4 && x + i < width; i++) {
@@ -86,6 +87,12 @@ static double relative_exposure(const struct personality *p, const struct exposu
     return e->time_s / p->t_ref_s * (p->n_ref / e->f_number) * (p->n_ref / e->f_number);
 }
 
+// Of this body, channel c: lens, filter and sensor are never quite the same twice.
+static double body_gain(const struct body *b, int c)
+{
+    return exp(b->personality->gain_spread * random_normal(b->seed, STREAM_GAIN, 3 * (uint64_t)b->index + (uint64_t)c));
+}
+
 static uint8_t srgb8(double v)
 {
     v = v <= 0 ? 0 : v >= 1 ? 1 : v <= .0031308 ? 12.92 * v : 1.055 * pow(v, 1 / 2.4) - .055;
@@ -105,8 +112,8 @@ static int develop(struct dataset *out, struct scene *scene, const struct body *
     int err = -ENOMEM;
     for (int y = 0; rgb && site && y < height; y++) {
         const int sy = (int)((int64_t)y * sensor_height / height) & ~1;
-        scene_row(scene, b->index, sy, site);
-        scene_row(scene, b->index, sy + 1, site + sensor_width);
+        scene_row(scene, b->index, &e->view, sy, site);
+        scene_row(scene, b->index, &e->view, sy + 1, site + sensor_width);
         for (int x = 0; x < width; x++) {
             const int sx = (int)((int64_t)x * sensor_width / width) & ~1;
             uint8_t *to = rgb + ((size_t)y * (size_t)width + (size_t)x) * 3;
@@ -130,12 +137,12 @@ int frame_open(struct frame **out, struct scene *scene, const struct body *b, co
     if (!f)
         return -ENOMEM;
     pthread_once(&normals_once, make_normals);
-    *f = (struct frame){ .scene = scene, .camera = b->index, .row_y = -1, .black = (float)p->black_level,
+    *f = (struct frame){ .scene = scene, .camera = b->index, .view = e->view, .row_y = -1, .black = (float)p->black_level,
                          .white = (float)p->white_level, .noise_seed = random_u64(b->seed, b->index, e->shot),
                          .read_variance = (float)(p->read_noise_e * p->read_noise_e) };
     f->dn_per_electron = (float)((p->white_level - p->black_level) / p->full_well_e * e->iso / 100);
     for (int c = 0; c < 3; c++)
-        f->electrons[c] = (float)(p->full_well_e * p->wb[c] * relative_exposure(p, e));
+        f->electrons[c] = (float)(p->full_well_e * p->wb[c] * relative_exposure(p, e) * body_gain(b, c));
     if (file == FILES_JPEG) {
         err = develop(&f->jpeg, scene, b, e, JPEG_WIDTH);
     } else {

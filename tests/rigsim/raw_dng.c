@@ -8,6 +8,7 @@
 #include <tiffio.h>
 
 #include <errno.h>
+#include <stdbool.h>
 #include <stdio.h>
 #include <stdlib.h>
 #include <string.h>
@@ -115,8 +116,11 @@ static int write_exif(TIFF *t, const struct raw_dng_info *i, const char *date, c
 static int write_main(TIFF *t, const struct raw_dng_info *i, const char *date, uint64_t exif_at)
 {
     static const uint16_t two_by_two[2] = { 2, 2 };
-    static const uint8_t rggb[4] = { 0, 1, 1, 2 }, version[4] = { 1, 4, 0, 0 }, backward[4] = { 1, 1, 0, 0 };
-    const float black = (float)i->black_level, neutral[3] = { (float)i->wb[0], (float)i->wb[1], (float)i->wb[2] };
+    static const uint8_t rggb[4] = { 0, 1, 1, 2 }, none[4] = { 0 }, version[4] = { 1, 4, 0, 0 }, backward[4] = { 1, 1, 0, 0 };
+    const uint8_t *cfa = memcmp(i->cfa, none, 4) ? i->cfa : rggb;
+    const float black[4] = { (float)(i->black_level + i->black_more[0]), (float)(i->black_level + i->black_more[1]),
+                             (float)(i->black_level + i->black_more[2]), (float)(i->black_level + i->black_more[3]) };
+    const float neutral[3] = { (float)i->wb[0], (float)i->wb[1], (float)i->wb[2] };
     const uint32_t white = (uint32_t)i->white_level;
     float matrix[9];
     for (int k = 0; k < 9; k++)
@@ -126,15 +130,17 @@ static int write_main(TIFF *t, const struct raw_dng_info *i, const char *date, u
     ok = ok && TIFFSetField(t, TIFFTAG_BITSPERSAMPLE, 16) && TIFFSetField(t, TIFFTAG_SAMPLESPERPIXEL, 1);
     ok = ok && TIFFSetField(t, TIFFTAG_COMPRESSION, COMPRESSION_NONE) && TIFFSetField(t, TIFFTAG_PHOTOMETRIC, CFA);
     ok = ok && TIFFSetField(t, TIFFTAG_PLANARCONFIG, PLANARCONFIG_CONTIG);
-    ok = ok && TIFFSetField(t, TIFFTAG_ORIENTATION, ORIENTATION_TOPLEFT);
+    ok = ok && TIFFSetField(t, TIFFTAG_ORIENTATION, i->orientation ? i->orientation : ORIENTATION_TOPLEFT);
     ok = ok && TIFFSetField(t, TIFFTAG_ROWSPERSTRIP, ROWS_PER_STRIP);
     ok = ok && TIFFSetField(t, TIFFTAG_MAKE, i->make) && TIFFSetField(t, TIFFTAG_MODEL, i->model);
     ok = ok && TIFFSetField(t, TIFFTAG_SOFTWARE, i->firmware) && TIFFSetField(t, TIFFTAG_DATETIME, date);
-    ok = ok && TIFFSetField(t, TIFFTAG_CFAREPEATPATTERNDIM, two_by_two) && TIFFSetField(t, TIFFTAG_CFAPATTERN, 4, rggb);
+    ok = ok && TIFFSetField(t, TIFFTAG_CFAREPEATPATTERNDIM, two_by_two) && TIFFSetField(t, TIFFTAG_CFAPATTERN, 4, cfa);
     ok = ok && TIFFSetField(t, TIFFTAG_DNGVERSION, version) && TIFFSetField(t, TIFFTAG_DNGBACKWARDVERSION, backward);
     ok = ok && TIFFSetField(t, TIFFTAG_UNIQUECAMERAMODEL, i->model);
     ok = ok && TIFFSetField(t, TIFFTAG_CAMERASERIALNUMBER, i->serial);
-    ok = ok && TIFFSetField(t, TIFFTAG_BLACKLEVEL, 1, &black) && TIFFSetField(t, TIFFTAG_WHITELEVEL, 1, &white);
+    const bool one_black = !i->black_more[0] && !i->black_more[1] && !i->black_more[2] && !i->black_more[3];
+    ok = ok && (one_black || TIFFSetField(t, TIFFTAG_BLACKLEVELREPEATDIM, two_by_two));
+    ok = ok && TIFFSetField(t, TIFFTAG_BLACKLEVEL, one_black ? 1 : 4, black) && TIFFSetField(t, TIFFTAG_WHITELEVEL, 1, &white);
     ok = ok && TIFFSetField(t, TIFFTAG_COLORMATRIX1, 9, matrix);
     ok = ok && TIFFSetField(t, TIFFTAG_CALIBRATIONILLUMINANT1, ILLUMINANT_D65);
     ok = ok && TIFFSetField(t, TIFFTAG_ASSHOTNEUTRAL, 3, neutral);
@@ -144,8 +150,7 @@ static int write_main(TIFF *t, const struct raw_dng_info *i, const char *date, u
 int raw_dng_make(struct raw_dng *out, const struct raw_dng_info *i)
 {
     *out = (struct raw_dng){ 0 };
-    if (i->width_px < 16 || i->width_px > 20000 || i->width_px % 2 || i->height_px < 16 || i->height_px > 20000 ||
-        i->height_px % 2)
+    if (i->width_px < 16 || i->width_px > 20000 || i->height_px < 16 || i->height_px > 20000)
         return -EINVAL;
     const size_t row_bytes = (size_t)i->width_px * 2;
     struct memory_file f = { 0 };
