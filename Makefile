@@ -52,10 +52,10 @@ FUZZED := $(LIBRARY) $(RIG) $(RIGSIM_LIB) $(FIRMWARE_SIM) # what a fuzzer calls 
 
 # ---- rules --------------------------------------------------------------------------------------------------------------
 object = $(patsubst %.c,$(BUILD)/obj/%.o,$(1))
-ifneq ($(filter firmware test test-vm demo bench bench-develop bench-panorama bench-rig chart figure5 figures stability experiments,$(MAKECMDGOALS)),)
+ifneq ($(filter firmware test test-vm demo bench bench-develop bench-firmware bench-panorama bench-rig chart figure5 figures stability experiments,$(MAKECMDGOALS)),)
 FIRST := deps # these install what is missing before the first file is compiled
 endif
-.PHONY: all firmware deps deps-fuzz deps-bench test test-vm demo bench bench-develop bench-panorama bench-rig chart figure5 figures stability experiments fuzz check-includes man install clean help
+.PHONY: all firmware deps deps-fuzz deps-bench test test-vm demo bench bench-develop bench-firmware bench-panorama bench-rig chart figure5 figures stability experiments fuzz check-includes man install clean help
 .DELETE_ON_ERROR:
 .SECONDARY:
 
@@ -128,9 +128,9 @@ $(addprefix $(BUILD)/tests/,$(BOARD_TESTS)) $(BUILD)/tests/board/boardsim: LIBS 
 $(addprefix $(BUILD)/tests/,$(BOARD_TESTS)) $(BUILD)/tests/board/boardsim: | build/firmware/trigger.elf
 $(BUILD)/tests/test_usb_camera $(addprefix $(BUILD)/tests/,$(BOARD_TESTS)): | $(BUILD)/bin/rigd $(BUILD)/bin/rigd-camera
 $(BUILD)/tests/test_pcg: LIBS += $(if $(wildcard /usr/include/suitesparse/cholmod.h),-lcholmod)
-$(BUILD)/tests/test_firmware: $(call object,$(FIRMWARE_SIM))
-$(BUILD)/tests/test_firmware_avr $(BUILD)/tests/bench/bench_firmware: $(call object,tests/board/simavr_board.c)
-$(BUILD)/tests/bench/bench_firmware: $(call object,$(FIRMWARE_SIM))
+$(BUILD)/tests/test_firmware: $(call object,$(FIRMWARE_SIM) tests/board/frames.c)
+$(BUILD)/tests/test_firmware_avr: $(call object,tests/board/frames.c tests/board/simavr_board.c)
+$(BUILD)/tests/bench/bench_firmware: $(call object,$(FIRMWARE_SIM) tests/board/frames.c tests/board/simavr_board.c)
 $(BUILD)/tests/test_firmware_avr $(BUILD)/tests/bench/bench_firmware: LIBS += -lsimavr -lelf
 $(BUILD)/tests/test_firmware_avr $(BUILD)/tests/bench/bench_firmware: | build/firmware/trigger.elf
 $(BUILD)/fuzz/obj/%.o: %.c Makefile | deps-fuzz
@@ -202,6 +202,8 @@ bench: deps $(BENCH_PROGRAMS) $(BUILD)/bin/rigsolve
 PANORAMAS ?= $(wildcard ../shared/data/hdri/studio_small_03_1k.hdr) build/panorama/synth/panorama.exr
 bench-panorama: deps deps-bench $(BUILD)/tests/bench/bench_panorama $(BUILD)/bin/rigd-panorama $(BUILD)/bin/rigsolve
 	@BIN=$(BUILD)/bin BENCH=$(BUILD)/tests/bench/bench_panorama sh tests/bench/panorama.sh build/panorama $(PANORAMAS)
+bench-firmware: deps $(BUILD)/tests/bench/bench_firmware
+	@$(BUILD)/tests/bench/bench_firmware $(FIRMWARE_BENCH)
 RIG_BENCHES ?= scale faults soak lag full eio kills
 bench-rig: deps all
 	@for b in $(RIG_BENCHES); do echo "== $$b"; BIN=$(BUILD)/bin perl tests/bench/rig.pl $$b || failed=1; done; [ -z "$$failed" ]
