@@ -129,9 +129,8 @@ $(addprefix $(BUILD)/tests/,$(BOARD_TESTS)) $(BUILD)/tests/board/boardsim: LIBS 
 $(addprefix $(BUILD)/tests/,$(BOARD_TESTS)) $(BUILD)/tests/board/boardsim: | build/firmware/trigger.elf
 $(BUILD)/tests/test_usb_camera $(addprefix $(BUILD)/tests/,$(BOARD_TESTS)): | $(BUILD)/bin/rigd $(BUILD)/bin/rigd-camera
 $(BUILD)/tests/test_pcg: LIBS += $(if $(wildcard /usr/include/suitesparse/cholmod.h),-lcholmod)
-$(BUILD)/tests/test_firmware: $(call object,$(FIRMWARE_SIM) tests/board/frames.c)
-$(BUILD)/tests/test_firmware_avr: $(call object,tests/board/frames.c tests/board/simavr_board.c)
-$(BUILD)/tests/bench/bench_firmware: $(call object,$(FIRMWARE_SIM) tests/board/frames.c tests/board/simavr_board.c)
+$(BUILD)/tests/test_firmware: $(call object,$(FIRMWARE_SIM))
+$(BUILD)/tests/bench/bench_firmware: $(call object,$(FIRMWARE_SIM))
 $(BUILD)/tests/test_firmware_avr $(BUILD)/tests/bench/bench_firmware: LIBS += -lsimavr -lelf
 $(BUILD)/tests/test_firmware_avr $(BUILD)/tests/bench/bench_firmware: | build/firmware/trigger.elf
 $(BUILD)/fuzz/obj/%.o: %.c Makefile | deps-fuzz
