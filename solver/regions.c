@@ -1,6 +1,7 @@
 // solver/regions.c - dealing texels out to shared reflectances, merging those, and choosing what each texel may have for itself.
 #include "solver/regions.h"
 
+#include "solver/labelling.h"
 #include "solver/lm.h"
 #include "solver/packed.h"
 #include "solver/parallel.h"
@@ -46,7 +47,11 @@ struct search {
     struct texel_worker **worker;
     int n_workers, n_threads;
     uint8_t *region;                     // [level n]
-    float *cost;                         // [level n][REGIONS_MAX]
+    float *cost;                         // [level n][REGIONS_MAX] of a sample, in the mean
+    float *evidence;                     // the same as nats
+    int *n_samples;                      // [level n]
+    float (*colour)[3];                  // [level n] of a matt surface, logarithms; NAN: not known
+    float bandwidth[3];
     double hold;                         // draws what nothing determines towards plain, beside the sum of squares
     struct regions *out;
 };
@@ -326,6 +331,7 @@ static void cost_nodes(void *arg, int64_t begin, int64_t end, int worker)
             memcpy(albedo, s->albedo[s->texel[i]], sizeof(albedo));
             texel_fit_albedo(s->scene, s->worker[worker], s->texel[i], 0, s->out->region[r].theta, albedo, 1, &sums);
             s->cost[i * REGIONS_MAX + r] = (float)(sums.cost / fmax(sums.n, 1));
+            s->n_samples[i] = sums.n;
         }
 }
 
@@ -335,30 +341,13 @@ static int by_float(const void *a, const void *b)
     return (x > y) - (x < y);
 }
 
-// Each node to the cheapest region; `unit`: what disagreeing with a neighbour costs.
-static void deal(const struct level *l, const float *cost, int n_regions, float unit, uint8_t *region)
+// Nats against each region of a texel whose errors have a variance of their own, unknown: n/2 log(sum of squares). Errors of a texel's samples go
+// together: lights, shape.
+static void weigh_evidence(const float *cost, int n_regions, int n_samples, float *evidence)
 {
-    for (int i = 0; i < l->n; i++) {
-        const float *c = cost + (size_t)i * REGIONS_MAX;
-        int best = 0;
-        for (int r = 1; r < n_regions; r++)
-            best = c[r] < c[best] ? r : best;
-        region[i] = (uint8_t)best;
-    }
-    for (int sweep = 0; sweep < 4; sweep++) // iterated conditional modes
-        for (int i = 0; i < l->n; i++) {
-            const float *c = cost + (size_t)i * REGIONS_MAX;
-            float best_cost = INFINITY;
-            int best = 0;
-            for (int r = 0; r < n_regions; r++) {
-                float sum = c[r];
-                for (int32_t m = l->first_neighbour[i]; m < l->first_neighbour[i + 1]; m++)
-                    sum += region[l->neighbour[m]] != r ? unit : 0;
-                if (sum < best_cost)
-                    best_cost = sum, best = r;
-            }
-            region[i] = (uint8_t)best;
-        }
+    static const float independent = .25f; // of its samples
+    for (int r = 0; r < n_regions; r++)
+        evidence[r] = isinf(cost[r]) ? INFINITY : .5f * independent * (float)n_samples * logf(cost[r] + (float)rounding2);
 }
 
 static int deal_out(struct search *s)
@@ -380,9 +369,44 @@ static int deal_out(struct search *s)
     qsort(least, (size_t)n, sizeof(float), by_float);
     const double median = n ? (double)least[n / 2] : 0; // half the squares of a sample's three channels
     s->hold = fmin(2 * median / 3 / plain_variance, first_hold);
-    deal(l, s->cost, s->out->n, .5f * (float)median, s->region);
     free(least);
-    return 0;
+    for (int i = 0; i < l->n; i++)
+        weigh_evidence(s->cost + (size_t)i * REGIONS_MAX, s->out->n, s->n_samples[i], s->evidence + (size_t)i * REGIONS_MAX);
+    const struct labelling job = { .level = l, .n_labels = s->out->n, .stride = REGIONS_MAX, .evidence = s->evidence,
+                                   .colour = (const float(*)[3])s->colour, .bandwidth = s->bandwidth, .votes = true };
+    return labelling_find(s->region, &job);
+}
+
+// A matt surface's albedo by the median of the samples: what most views see, whatever a few see mirrored. False: no light, no samples.
+static bool colour_of(const struct texel_scene *scene, struct texel_worker *worker, int texel, float colour[3])
+{
+    static const float matt[DISNEY_N] = { [DISNEY_ROUGHNESS] = 1 }, grey[3] = { .5f, .5f, .5f };
+    static const float least_albedo = .01f;
+    const struct texel_row *rows;
+    struct texel_scene plainly = *scene;
+    float of_sample[3][TEXEL_VIEWS_MAX];
+    int n[3] = { 0 };
+    plainly.robust_scale = 0;
+    const int n_rows = texel_rows(&plainly, worker, texel, matt, grey, &rows);
+    for (int k = 0; k < n_rows; k++)
+        for (int c = 0; c < 3; c++)
+            if (rows[k].J[DISNEY_N + c] > 1e-4f)
+                of_sample[c][n[c]++] = grey[c] - rows[k].residual / rows[k].J[DISNEY_N + c];
+    for (int c = 0; c < 3; c++) {
+        if (!n[c])
+            return false;
+        qsort(of_sample[c], (size_t)n[c], sizeof(float), by_float);
+        colour[c] = logf(fmaxf(of_sample[c][n[c] / 2], 0) + least_albedo);
+    }
+    return true;
+}
+
+static void colour_nodes(void *arg, int64_t begin, int64_t end, int worker)
+{
+    struct search *s = arg;
+    for (int64_t i = begin; i < end; i++)
+        if (s->texel[i] < 0 || !colour_of(s->scene, s->worker[worker], s->texel[i], s->colour[i]))
+            s->colour[i][0] = NAN;
 }
 
 static void count(struct search *s)
@@ -841,6 +865,9 @@ static void search_free(struct search *s)
     free((void *)s->aside.use_view);
     free(s->texel);
     free(s->cost);
+    free(s->evidence);
+    free(s->n_samples);
+    free(s->colour);
 }
 
 static int search_new(struct search *s, const struct texel_scene *scene, const struct level *level)
@@ -852,9 +879,12 @@ static int search_new(struct search *s, const struct texel_scene *scene, const s
     s->inner.use_view = inner, s->aside.use_view = aside;
     s->texel = malloc(((size_t)level->n + 1) * sizeof(*s->texel));
     s->cost = malloc(((size_t)level->n + 1) * REGIONS_MAX * sizeof(float));
+    s->evidence = malloc(((size_t)level->n + 1) * REGIONS_MAX * sizeof(float));
+    s->n_samples = calloc((size_t)level->n + 1, sizeof(*s->n_samples));
+    s->colour = malloc(((size_t)level->n + 1) * sizeof(*s->colour));
     s->n_workers = s->n_threads > 0 ? s->n_threads : parallel_n_cores();
     s->worker = calloc((size_t)s->n_workers, sizeof(*s->worker));
-    if (!inner || !aside || !s->texel || !s->cost || !s->worker)
+    if (!inner || !aside || !s->texel || !s->cost || !s->evidence || !s->n_samples || !s->colour || !s->worker)
         return -ENOMEM;
     for (int i = 0; i < s->n_workers; i++)
         if (texel_worker_new(&s->worker[i], scene))
@@ -869,6 +899,8 @@ static int search_new(struct search *s, const struct texel_scene *scene, const s
         if (s->texel[i] >= 0 && scene->samples->first[s->texel[i]] == scene->samples->first[s->texel[i] + 1])
             s->texel[i] = -1;
     }
+    parallel_for(s->n_threads, level->n, 16, colour_nodes, s);
+    labelling_bandwidth(s->bandwidth, (const float(*)[3])s->colour, level->n);
     return 0;
 }
 
@@ -908,21 +940,26 @@ struct refinement {
     const float (*albedo)[3];
     uint8_t *region;
     uint8_t *candidates; // [level n] a bit per region; 0: no doubt
-    float *cost;         // [level n][REGIONS_MAX]
+    float *evidence;     // [level n][REGIONS_MAX]
+    float (*colour)[3];
     struct texel_worker **worker;
 };
 
-static void cost_doubtful(void *arg, int64_t begin, int64_t end, int worker)
+static void weigh_doubtful(void *arg, int64_t begin, int64_t end, int worker)
 {
     const struct refinement *f = arg;
     const struct level *l = f->level;
     for (int i = (int)begin; i < (int)end; i++) {
-        float *cost = f->cost + (size_t)i * REGIONS_MAX;
-        for (int r = 0; r < f->r->n; r++)
-            cost[r] = f->candidates[i] ? (f->candidates[i] >> r & 1 ? 0 : INFINITY) : (f->region[i] == r ? 0 : INFINITY);
+        float cost[REGIONS_MAX];
         const int32_t first = l->first_delegate ? l->first_delegate[i] : 0, n = l->first_delegate ? l->first_delegate[i + 1] - first : 1;
-        for (int r = 0; f->candidates[i] && r < f->r->n; r++) {
+        int n_samples = 0;
+        f->colour[i][0] = NAN;
+        if (f->candidates[i] && n)
+            if (!colour_of(f->scene, f->worker[worker], l->first_delegate ? l->delegate[first] : i, f->colour[i]))
+                f->colour[i][0] = NAN;
+        for (int r = 0; r < f->r->n; r++) {
             struct texel_sums sums = { 0 };
+            cost[r] = f->candidates[i] ? f->candidates[i] >> r & 1 ? 0 : INFINITY : f->region[i] == r ? 0 : INFINITY;
             for (int32_t d = 0; d < n && (f->candidates[i] >> r & 1); d++) {
                 const int32_t t = l->first_delegate ? l->delegate[first + d] : i;
                 float albedo[3];
@@ -930,8 +967,9 @@ static void cost_doubtful(void *arg, int64_t begin, int64_t end, int worker)
                 texel_fit_albedo(f->scene, f->worker[worker], t, 0, f->r->region[r].theta, albedo, 1, &sums);
             }
             if (f->candidates[i] >> r & 1)
-                cost[r] = (float)(sums.cost / fmax(sums.n, 1));
+                cost[r] = (float)(sums.cost / fmax(sums.n, 1)), n_samples = sums.n;
         }
+        weigh_evidence(cost, f->r->n, n_samples, f->evidence + (size_t)i * REGIONS_MAX);
     }
 }
 
@@ -941,9 +979,10 @@ int regions_refine(const struct regions *r, uint8_t *region_of, const uint8_t *p
     const size_t n = (size_t)level->n + 1;
     const int n_workers = n_threads > 0 ? n_threads : parallel_n_cores();
     struct refinement f = { .r = r, .scene = scene, .level = level, .albedo = albedo, .region = region_of,
-                            .candidates = calloc(n, 1), .cost = malloc(n * REGIONS_MAX * sizeof(float)),
+                            .candidates = calloc(n, 1), .evidence = malloc(n * REGIONS_MAX * sizeof(float)),
+                            .colour = malloc(n * sizeof(*f.colour)),
                             .worker = calloc((size_t)n_workers, sizeof(*f.worker)) };
-    int err = f.candidates && f.cost && f.worker ? 0 : -ENOMEM;
+    int err = f.candidates && f.evidence && f.colour && f.worker ? 0 : -ENOMEM;
     for (int i = 0; !err && i < n_workers; i++)
         err = texel_worker_new(&f.worker[i], scene);
     for (int i = 0; i < level->n; i++)
@@ -960,22 +999,18 @@ int regions_refine(const struct regions *r, uint8_t *region_of, const uint8_t *p
         f.candidates[i] = (uint8_t)(around & (around - 1) ? around : 0);
     }
     if (!err) {
-        float unit = 0; // from the texels in doubt: the mean of their least costs
-        int n_doubtful = 0;
-        parallel_for(n_threads, level->n, 64, cost_doubtful, &f);
-        for (int i = 0; i < level->n; i++) {
-            float least = INFINITY;
-            for (int k = 0; f.candidates[i] && k < r->n; k++)
-                least = fminf(least, f.cost[(size_t)i * REGIONS_MAX + (size_t)k]);
-            if (f.candidates[i])
-                unit += least, n_doubtful++;
-        }
-        deal(level, f.cost, r->n, n_doubtful ? .25f * unit / (float)n_doubtful : 0, region_of);
+        float bandwidth[3];
+        parallel_for(n_threads, level->n, 64, weigh_doubtful, &f);
+        labelling_bandwidth(bandwidth, (const float(*)[3])f.colour, level->n);
+        const struct labelling job = { .level = level, .n_labels = r->n, .stride = REGIONS_MAX, .evidence = f.evidence,
+                                       .colour = (const float(*)[3])f.colour, .bandwidth = bandwidth };
+        err = labelling_find(region_of, &job);
     }
     for (int i = 0; f.worker && i < n_workers; i++)
         texel_worker_free(f.worker[i]);
     free(f.worker);
     free(f.candidates);
-    free(f.cost);
+    free(f.evidence);
+    free(f.colour);
     return err;
 }

@@ -1,0 +1,140 @@
+// solver/labelling.c - mean field over neighbours and over nodes of like colour.
+#include "solver/labelling.h"
+
+#include <errno.h>
+#include <math.h>
+#include <stdlib.h>
+#include <string.h>
+
+enum { MOST_LABELS = 8, LANDMARKS = 512, SWEEPS = 12 };
+static const float agreement = 1.5f;  // nats that a neighbour of the same colour is worth
+static const float unlike = .1f;    // share of it that is left across an edge of colour
+static const float any_colour = .02f; // a material may have a colour that none of its nodes has so far
+static const float least_bandwidth = .02f;
+
+// Luminance and two tints.
+static void axes_of(const float colour[3], float axis[3])
+{
+    axis[0] = (colour[0] + colour[1] + colour[2]) / 3;
+    axis[1] = colour[0] - colour[1];
+    axis[2] = colour[2] - colour[1];
+}
+
+void labelling_bandwidth(float bandwidth[3], const float (*colour)[3], int n)
+{
+    double sum[3] = { 0 }, squares[3] = { 0 };
+    int known = 0;
+    for (int i = 0; i < n; i++) {
+        float axis[3];
+        if (isnan(colour[i][0]))
+            continue;
+        axes_of(colour[i], axis);
+        for (int c = 0; c < 3; c++)
+            sum[c] += (double)axis[c], squares[c] += (double)axis[c] * (double)axis[c];
+        known++;
+    }
+    for (int c = 0; c < 3; c++) {
+        const double mean = sum[c] / fmax(known, 1), variance = fmax(squares[c] / fmax(known, 1) - mean * mean, 0);
+        bandwidth[c] = fmaxf(least_bandwidth, (float)(sqrt(variance) * pow(.8 * fmax(known, 1), -1. / 7))); // (4 / (d + 2))^(1/7) n^(-1/7), d = 3
+    }
+}
+
+// 1: the same colour.
+static float likeness(const struct labelling *j, int a, int b)
+{
+    float x[3], y[3], sum = 0;
+    if (isnan(j->colour[a][0]) || isnan(j->colour[b][0]))
+        return 0;
+    axes_of(j->colour[a], x), axes_of(j->colour[b], y);
+    for (int c = 0; c < 3; c++)
+        sum += (x[c] - y[c]) * (x[c] - y[c]) / (j->bandwidth[c] * j->bandwidth[c]);
+    return sum < 50 ? expf(-.5f * sum) : 0;
+}
+
+// share[]: of each label, exp(-nats) made to sum to 1.
+static void share_out(const float *nats, int n, float *share)
+{
+    float least = INFINITY, sum = 0;
+    for (int r = 0; r < n; r++)
+        least = fminf(least, nats[r]);
+    for (int r = 0; r < n; r++)
+        sum += share[r] = isinf(least) ? 1 : expf(least - nats[r]);
+    for (int r = 0; r < n; r++)
+        share[r] /= sum;
+}
+
+// Of all nodes whose colour is known, evenly spread.
+static int choose_landmarks(const struct labelling *j, int *landmark)
+{
+    int n = 0, kept = 0, seen = 0;
+    for (int i = 0; i < j->level->n; i++)
+        n += !isnan(j->colour[i][0]);
+    const int keep = n < LANDMARKS ? n : LANDMARKS;
+    for (int i = 0; i < j->level->n; i++) {
+        if (isnan(j->colour[i][0]))
+            continue;
+        if ((int64_t)(seen + 1) * keep / n > (int64_t)seen * keep / n)
+            landmark[kept++] = i;
+        seen++;
+    }
+    return kept;
+}
+
+// What nodes of the same colour are.
+static void vote(const struct labelling *j, const float *share, const float *like, const int *landmark, int n_landmarks, int i, float nats[MOST_LABELS])
+{
+    float sum[MOST_LABELS] = { 0 }, all = any_colour;
+    for (int k = 0; k < n_landmarks; k++) {
+        const float w = landmark[k] == i ? 0 : like[k];
+        all += w;
+        for (int r = 0; r < j->n_labels; r++)
+            sum[r] += w * share[landmark[k] * MOST_LABELS + r];
+    }
+    for (int r = 0; r < j->n_labels; r++)
+        nats[r] -= logf((sum[r] / all + any_colour / (float)j->n_labels) / (1 + any_colour));
+}
+
+int labelling_find(uint8_t *label, const struct labelling *j)
+{
+    const struct level *l = j->level;
+    const size_t n = (size_t)l->n + 1;
+    int landmark[LANDMARKS];
+    const int n_landmarks = j->votes ? choose_landmarks(j, landmark) : 0;
+    float *share = malloc(n * MOST_LABELS * sizeof(float)), *next = malloc(n * MOST_LABELS * sizeof(float));
+    float *like = malloc((n * (size_t)n_landmarks + 1) * sizeof(float));
+    float *edge = malloc(((size_t)l->first_neighbour[l->n] + 1) * sizeof(float));
+    const int err = share && next && like && edge ? 0 : -ENOMEM;
+    for (int i = 0; !err && i < l->n; i++) {
+        share_out(j->evidence + (size_t)i * (size_t)j->stride, j->n_labels, share + (size_t)i * MOST_LABELS);
+        for (int k = 0; k < n_landmarks; k++)
+            like[(size_t)i * (size_t)n_landmarks + (size_t)k] = likeness(j, i, landmark[k]);
+        for (int32_t m = l->first_neighbour[i]; m < l->first_neighbour[i + 1]; m++)
+            edge[m] = agreement * (unlike + (1 - unlike) * likeness(j, i, l->neighbour[m]));
+    }
+    for (int sweep = 0; !err && sweep < SWEEPS; sweep++) {
+        for (int i = 0; i < l->n; i++) {
+            float nats[MOST_LABELS];
+            for (int r = 0; r < j->n_labels; r++) {
+                nats[r] = j->evidence[(size_t)i * (size_t)j->stride + (size_t)r];
+                for (int32_t m = l->first_neighbour[i]; m < l->first_neighbour[i + 1]; m++)
+                    nats[r] -= edge[m] * share[(size_t)l->neighbour[m] * MOST_LABELS + (size_t)r];
+            }
+            if (n_landmarks && !isnan(j->colour[i][0]))
+                vote(j, share, like + (size_t)i * (size_t)n_landmarks, landmark, n_landmarks, i, nats);
+            share_out(nats, j->n_labels, next + (size_t)i * MOST_LABELS);
+        }
+        for (size_t k = 0; k < (size_t)l->n * MOST_LABELS; k++) // half way: no node and its neighbour change places for ever
+            share[k] = .5f * (share[k] + next[k]);
+    }
+    for (int i = 0; !err && i < l->n; i++) {
+        const float *s = share + (size_t)i * MOST_LABELS;
+        label[i] = 0;
+        for (int r = 1; r < j->n_labels; r++)
+            label[i] = s[r] > s[label[i]] ? (uint8_t)r : label[i];
+    }
+    free(share);
+    free(next);
+    free(like);
+    free(edge);
+    return err;
+}
