@@ -54,6 +54,7 @@ struct search {
     float bandwidth[3];
     double hold;                         // draws what nothing determines towards plain, beside the sum of squares
     struct regions *out;
+    uint16_t frozen[REGIONS_MAX];        // of each region: metallic, or nothing
 };
 
 struct witnesses {
@@ -330,7 +331,7 @@ static void cost_nodes(void *arg, int64_t begin, int64_t end, int worker)
                 continue;
             memcpy(albedo, s->albedo[s->texel[i]], sizeof(albedo));
             texel_fit_albedo(s->scene, s->worker[worker], s->texel[i], 0, s->out->region[r].theta, albedo, 1, &sums);
-            s->cost[i * REGIONS_MAX + r] = (float)(sums.cost / fmax(sums.n, 1));
+            s->cost[i * REGIONS_MAX + r] = (float)(sums.left_out_cost / fmax(sums.n, 1));
             s->n_samples[i] = sums.n;
         }
 }
@@ -431,7 +432,30 @@ static void drop(struct search *s, int r)
     if (r != last) {
         rename_region(s, last, r);
         s->out->region[r] = s->out->region[last];
+        s->frozen[r] = s->frozen[last];
     }
+}
+
+// As a dielectric or with what metal the samples want, whichever explains views set aside. A little metal lets every texel choose its own specular
+// colour, which passes for anything in the views that were fitted.
+static int fit_either(struct search *s, const struct witnesses *w, bool anywhere, float theta[DISNEY_N], uint16_t *frozen)
+{
+    float dielectric[DISNEY_N];
+    double with, without;
+    memcpy(dielectric, theta, sizeof(dielectric));
+    int err = fit_shared(s, &s->inner, w, 0, anywhere, theta);
+    if (!err)
+        err = fit_shared(s, &s->inner, w, 1 << DISNEY_METALLIC, anywhere, dielectric);
+    if (!err)
+        err = test(s, w, theta, 0, -1, &with, NULL, NULL);
+    if (!err)
+        err = test(s, w, dielectric, 0, -1, &without, NULL, NULL);
+    if (err)
+        return err;
+    *frozen = without < better_without * with ? 1 << DISNEY_METALLIC : 0;
+    if (*frozen)
+        memcpy(theta, dielectric, sizeof(dielectric));
+    return 0;
 }
 
 static int fit_all(struct search *s, bool anywhere)
@@ -440,7 +464,8 @@ static int fit_all(struct search *s, bool anywhere)
     for (int r = 0; !err && r < s->out->n; r++) {
         struct witnesses w;
         call_witnesses(s, 1u << r, &w);
-        err = fit_shared(s, &s->inner, &w, 0, anywhere, s->out->region[r].theta);
+        if (w.n)
+            err = fit_either(s, &w, anywhere, s->out->region[r].theta, &s->frozen[r]);
     }
     return err;
 }
@@ -735,14 +760,16 @@ static int merge(struct search *s)
             if (!err)
                 err = region_uncertainty(s, &s->inner, &w[r], 0, &s->out->region[r]);
         }
+        uint16_t best_frozen = 0;
         for (int a = 0; !err && a < s->out->n; a++)
             for (int b = a + 1; !err && b < s->out->n; b++) {
                 struct witnesses both;
                 float theta[DISNEY_N], one[WITNESSES], other[WITNESSES];
+                uint16_t frozen = 0;
                 call_both(&w[a], &w[b], &both);
                 for (int p = 0; p < DISNEY_N; p++)
                     theta[p] = .5f * (s->out->region[a].theta[p] + s->out->region[b].theta[p]);
-                err = fit_shared(s, &s->inner, &both, 0, false, theta);
+                err = fit_either(s, &both, false, theta, &frozen);
                 if (!err)
                     err = test(s, &w[a], theta, 0, -1, &error2, NULL, one);
                 if (!err)
@@ -754,7 +781,7 @@ static int merge(struct search *s)
                 const double worse = fmax(worse_a, worse_b) / allowed;
                 log_debug("regions: %d and %d of %d as one: views aside %.4f x, %.4f x; allowed %.1f", a, b, s->out->n, worse_a, worse_b, allowed);
                 if (worse < least) {
-                    least = worse, best_a = a, best_b = b;
+                    least = worse, best_a = a, best_b = b, best_frozen = frozen;
                     memcpy(best_theta, theta, sizeof(theta));
                 }
             }
@@ -763,6 +790,7 @@ static int merge(struct search *s)
         log_debug("regions: %d and %d of %d become one", best_a, best_b, s->out->n);
         rename_region(s, best_b, best_a);
         memcpy(s->out->region[best_a].theta, best_theta, sizeof(best_theta));
+        s->frozen[best_a] = best_frozen;
         drop(s, best_b);
         err = fit_all(s, false);
         if (!err)
@@ -790,8 +818,12 @@ static int simplify(struct search *s, const struct witnesses *w, struct region *
         const int p = __builtin_ctz(without[k]); // the layer's amount; the other says how it looks
         double error;
         err = region_uncertainty(s, s->scene, w, *frozen, r);
-        if (!k)
+        if (!k && !err) {
             *full = *r;
+            err = region_uncertainty(s, s->scene, w, 0, full);
+        }
+        if (*frozen & without[k])
+            continue;
         if (!err)
             err = fit_shared(s, &s->inner, w, *frozen | without[k], false, simpler.theta);
         if (!err)
@@ -817,11 +849,23 @@ static int choose_freedom(struct search *s, struct region *r, int at)
     struct witnesses w;
     struct region full = { 0 };
     double error2 = 0, std;
-    uint16_t free_mask = 0, frozen = 0;
+    uint16_t free_mask = 0, frozen = s->frozen[at];
     call_witnesses(s, 1u << at, &w);
-    struct shared_fit first = { .s = s, .scene = &s->inner, .w = &w };
+    struct shared_fit first = { .s = s, .scene = &s->inner, .w = &w, .frozen = frozen };
     double cost;
     int err = w.n ? fit_from(&first, r->theta, 100, 1e-8, r->theta, &cost) : 0; // to the end: clearcoat against sheen is a long valley
+    for (int q = 0; q < 8 && !err; q++) {
+        static const float tt[8][3] = {{0,.3f,.72f},{0,.65f,.14f},{1,.5f,.3f},{0,.65f,.17f},{0,.65f,.2f},{0,.65f,.25f},{1,.5f,.35f},{1,.5f,.25f}};
+        float th[DISNEY_N]={0}; th[0]=tt[q][0]; th[2]=tt[q][1]; th[3]=tt[q][2]; th[9]=.5f;
+        struct shared_fit ff = { .s = s, .scene = &s->inner, .w = &w };
+        double c, e2, xx[DISNEY_N]; for (int k=0;k<DISNEY_N;k++) xx[k]=(double)th[k];
+        shared_cost(&ff, xx, &c); test(s,&w,th,0,-1,&e2,NULL,NULL);
+        log_debug("PROBE region %d: m %.0f s %.2f r %.2f: cost %.4f aside %.3f", at, (double)tt[q][0], (double)tt[q][1], (double)tt[q][2], c, 100*sqrt(e2));
+    }
+    { struct shared_fit ff = { .s = s, .scene = &s->inner, .w = &w };
+        double c, e2, xx[DISNEY_N]; for (int k=0;k<DISNEY_N;k++) xx[k]=(double)r->theta[k];
+        shared_cost(&ff, xx, &c); test(s,&w,r->theta,0,-1,&e2,NULL,NULL);
+        log_debug("PROBE region %d: found m %.2f ss %.2f s %.2f r %.2f st %.2f an %.2f sh %.2f sht %.2f cc %.2f ccg %.2f: cost %.4f aside %.3f", at, xx[0],xx[1],xx[2],xx[3],xx[4],xx[5],xx[6],xx[7],xx[8],xx[9], c, 100*sqrt(e2)); }
     if (!err)
         err = simplify(s, &w, r, at, &frozen, &error2, &full);
     for (int p = 0; p < DISNEY_N; p++)
@@ -967,7 +1011,7 @@ static void weigh_doubtful(void *arg, int64_t begin, int64_t end, int worker)
                 texel_fit_albedo(f->scene, f->worker[worker], t, 0, f->r->region[r].theta, albedo, 1, &sums);
             }
             if (f->candidates[i] >> r & 1)
-                cost[r] = (float)(sums.cost / fmax(sums.n, 1)), n_samples = sums.n;
+                cost[r] = (float)(sums.left_out_cost / fmax(sums.n, 1)), n_samples = sums.n;
         }
         weigh_evidence(cost, f->r->n, n_samples, f->evidence + (size_t)i * REGIONS_MAX);
     }
