@@ -6,11 +6,12 @@
 #include <stdlib.h>
 #include <string.h>
 
-enum { MOST_LABELS = 8, LANDMARKS = 512, SWEEPS = 12 };
+enum { MOST_LABELS = 8, LANDMARKS = 512, MOST_SWEEPS = 40 };
 static const float agreement = 1.5f;  // nats that a neighbour of the same colour is worth
 static const float unlike = .1f;    // share of it that is left across an edge of colour
 static const float any_colour = .02f; // a material may have a colour that none of its nodes has so far
 static const float least_bandwidth = .02f;
+static const float settled = .01f;    // no share moved further
 
 // Luminance and two tints.
 static void axes_of(const float colour[3], float axis[3])
@@ -20,23 +21,50 @@ static void axes_of(const float colour[3], float axis[3])
     axis[2] = colour[2] - colour[1];
 }
 
-void labelling_bandwidth(float bandwidth[3], const float (*colour)[3], int n)
+static int by_float(const void *a, const void *b)
 {
-    double sum[3] = { 0 }, squares[3] = { 0 };
-    int known = 0;
-    for (int i = 0; i < n; i++) {
-        float axis[3];
-        if (isnan(colour[i][0]))
-            continue;
-        axes_of(colour[i], axis);
-        for (int c = 0; c < 3; c++)
-            sum[c] += (double)axis[c], squares[c] += (double)axis[c] * (double)axis[c];
-        known++;
-    }
+    const float x = *(const float *)a, y = *(const float *)b;
+    return (x > y) - (x < y);
+}
+
+// The median difference of neighbours: most have one colour, so it is what colours are wrong by. step: room for every edge.
+static float noise_of(const struct level *l, const float (*colour)[3], int axis, float *step)
+{
+    int64_t n = 0;
+    for (int i = 0; i < l->n; i++)
+        for (int32_t m = l->first_neighbour[i]; m < l->first_neighbour[i + 1]; m++) {
+            const int j = l->neighbour[m];
+            float here[3], there[3];
+            if (j < i || isnan(colour[i][0]) || isnan(colour[j][0]))
+                continue;
+            axes_of(colour[i], here), axes_of(colour[j], there);
+            step[n++] = fabsf(here[axis] - there[axis]);
+        }
+    qsort(step, (size_t)n, sizeof(float), by_float);
+    return n ? step[n / 2] : 0;
+}
+
+int labelling_bandwidth(float bandwidth[3], const struct level *l, const float (*colour)[3])
+{
+    float *step = malloc(((size_t)l->first_neighbour[l->n] + 1) * sizeof(*step));
+    if (!step)
+        return -ENOMEM;
     for (int c = 0; c < 3; c++) {
-        const double mean = sum[c] / fmax(known, 1), variance = fmax(squares[c] / fmax(known, 1) - mean * mean, 0);
-        bandwidth[c] = fmaxf(least_bandwidth, (float)(sqrt(variance) * pow(.8 * fmax(known, 1), -1. / 7))); // (4 / (d + 2))^(1/7) n^(-1/7), d = 3
+        double sum = 0, squares = 0;
+        int n = 0;
+        for (int i = 0; i < l->n; i++) {
+            float axis[3];
+            if (isnan(colour[i][0]))
+                continue;
+            axes_of(colour[i], axis);
+            sum += (double)axis[c], squares += (double)axis[c] * (double)axis[c], n++;
+        }
+        const double mean = sum / fmax(n, 1), variance = fmax(squares / fmax(n, 1) - mean * mean, 0);
+        const float smooth = (float)(sqrt(variance) * pow(1.25 * fmax(n, 1), -1. / 7)); // ((d + 2) n / 4)^(-1 / (d + 4)), d = 3
+        bandwidth[c] = fmaxf(fmaxf(smooth, 3 * noise_of(l, colour, c, step)), least_bandwidth);
     }
+    free(step);
+    return 0;
 }
 
 // 1: the same colour.
@@ -80,8 +108,9 @@ static int choose_landmarks(const struct labelling *j, int *landmark)
     return kept;
 }
 
-// What nodes of the same colour are.
-static void vote(const struct labelling *j, const float *share, const float *like, const int *landmark, int n_landmarks, int i, float nats[MOST_LABELS])
+// How often this colour is met with each label, beside how often any is: of nodes of the same colour, by what they are.
+static void vote(const struct labelling *j, const float *share, const float *like, const int *landmark, int n_landmarks, const float usual[MOST_LABELS],
+                 int i, float nats[MOST_LABELS])
 {
     float sum[MOST_LABELS] = { 0 }, all = any_colour;
     for (int k = 0; k < n_landmarks; k++) {
@@ -91,7 +120,7 @@ static void vote(const struct labelling *j, const float *share, const float *lik
             sum[r] += w * share[landmark[k] * MOST_LABELS + r];
     }
     for (int r = 0; r < j->n_labels; r++)
-        nats[r] -= logf((sum[r] / all + any_colour / (float)j->n_labels) / (1 + any_colour));
+        nats[r] -= logf((sum[r] / all + any_colour * usual[r]) / usual[r]);
 }
 
 int labelling_find(uint8_t *label, const struct labelling *j)
@@ -111,7 +140,12 @@ int labelling_find(uint8_t *label, const struct labelling *j)
         for (int32_t m = l->first_neighbour[i]; m < l->first_neighbour[i + 1]; m++)
             edge[m] = agreement * (unlike + (1 - unlike) * likeness(j, i, l->neighbour[m]));
     }
-    for (int sweep = 0; !err && sweep < SWEEPS; sweep++) {
+    float moved = INFINITY;
+    for (int sweep = 0; !err && sweep < MOST_SWEEPS && moved > settled; sweep++) {
+        float usual[MOST_LABELS] = { 0 };
+        for (int k = 0; k < n_landmarks; k++)
+            for (int r = 0; r < j->n_labels; r++)
+                usual[r] += (share[landmark[k] * MOST_LABELS + r] + 1e-3f) / (float)n_landmarks;
         for (int i = 0; i < l->n; i++) {
             float nats[MOST_LABELS];
             for (int r = 0; r < j->n_labels; r++) {
@@ -120,11 +154,16 @@ int labelling_find(uint8_t *label, const struct labelling *j)
                     nats[r] -= edge[m] * share[(size_t)l->neighbour[m] * MOST_LABELS + (size_t)r];
             }
             if (n_landmarks && !isnan(j->colour[i][0]))
-                vote(j, share, like + (size_t)i * (size_t)n_landmarks, landmark, n_landmarks, i, nats);
+                vote(j, share, like + (size_t)i * (size_t)n_landmarks, landmark, n_landmarks, usual, i, nats);
             share_out(nats, j->n_labels, next + (size_t)i * MOST_LABELS);
         }
-        for (size_t k = 0; k < (size_t)l->n * MOST_LABELS; k++) // half way: no node and its neighbour change places for ever
-            share[k] = .5f * (share[k] + next[k]);
+        moved = 0;
+        for (int i = 0; i < l->n; i++) // half way: no node and its neighbour change places for ever
+            for (int r = 0; r < j->n_labels; r++) {
+                float *now = share + (size_t)i * MOST_LABELS + r;
+                moved = fmaxf(moved, fabsf(next[(size_t)i * MOST_LABELS + (size_t)r] - *now));
+                *now = .5f * (*now + next[(size_t)i * MOST_LABELS + (size_t)r]);
+            }
     }
     for (int i = 0; !err && i < l->n; i++) {
         const float *s = share + (size_t)i * MOST_LABELS;

@@ -18,5 +18,5 @@ struct labelling {
 // label[level n]. 0 or -ENOMEM.
 int labelling_find(uint8_t *label, const struct labelling *job);
 
-// How far colours scatter, as a kernel's width: Silverman's rule for each of three axes.
-void labelling_bandwidth(float bandwidth[3], const float (*colour)[3], int n);
+// How far apart colours may be and pass for one: what neighbours mostly differ by, or Silverman's width of a kernel over all. 0 or -ENOMEM.
+int labelling_bandwidth(float bandwidth[3], const struct level *level, const float (*colour)[3]);

@@ -704,7 +704,7 @@ static int region_uncertainty(struct search *s, const struct texel_scene *scene,
 }
 
 // By what factor the witnesses' errors grow from `alone` to `shared`: the mean over them of the logarithm, as texels are very unlike; and as
-// much less as could be chance (four standard errors).
+// much less as could be chance (two standard errors).
 static double how_much_worse(const float *shared, const float *alone, int n)
 {
     double sum = 0, squares = 0;
@@ -715,7 +715,7 @@ static double how_much_worse(const float *shared, const float *alone, int n)
     if (n < 2)
         return 1;
     const double mean = sum / n, variance = fmax(squares / n - mean * mean, 0) / (n - 1);
-    return exp(mean - 4 * sqrt(variance));
+    return exp(mean - 2 * sqrt(variance));
 }
 
 // Does some parameter of the two differ by more than is not known of it?
@@ -769,7 +769,7 @@ static int merge(struct search *s)
                 call_both(&w[a], &w[b], &both);
                 for (int p = 0; p < DISNEY_N; p++)
                     theta[p] = .5f * (s->out->region[a].theta[p] + s->out->region[b].theta[p]);
-                err = fit_either(s, &both, false, theta, &frozen);
+                err = fit_either(s, &both, true, theta, &frozen);
                 if (!err)
                     err = test(s, &w[a], theta, 0, -1, &error2, NULL, one);
                 if (!err)
@@ -854,18 +854,6 @@ static int choose_freedom(struct search *s, struct region *r, int at)
     struct shared_fit first = { .s = s, .scene = &s->inner, .w = &w, .frozen = frozen };
     double cost;
     int err = w.n ? fit_from(&first, r->theta, 100, 1e-8, r->theta, &cost) : 0; // to the end: clearcoat against sheen is a long valley
-    for (int q = 0; q < 8 && !err; q++) {
-        static const float tt[8][3] = {{0,.3f,.72f},{0,.65f,.14f},{1,.5f,.3f},{0,.65f,.17f},{0,.65f,.2f},{0,.65f,.25f},{1,.5f,.35f},{1,.5f,.25f}};
-        float th[DISNEY_N]={0}; th[0]=tt[q][0]; th[2]=tt[q][1]; th[3]=tt[q][2]; th[9]=.5f;
-        struct shared_fit ff = { .s = s, .scene = &s->inner, .w = &w };
-        double c, e2, xx[DISNEY_N]; for (int k=0;k<DISNEY_N;k++) xx[k]=(double)th[k];
-        shared_cost(&ff, xx, &c); test(s,&w,th,0,-1,&e2,NULL,NULL);
-        log_debug("PROBE region %d: m %.0f s %.2f r %.2f: cost %.4f aside %.3f", at, (double)tt[q][0], (double)tt[q][1], (double)tt[q][2], c, 100*sqrt(e2));
-    }
-    { struct shared_fit ff = { .s = s, .scene = &s->inner, .w = &w };
-        double c, e2, xx[DISNEY_N]; for (int k=0;k<DISNEY_N;k++) xx[k]=(double)r->theta[k];
-        shared_cost(&ff, xx, &c); test(s,&w,r->theta,0,-1,&e2,NULL,NULL);
-        log_debug("PROBE region %d: found m %.2f ss %.2f s %.2f r %.2f st %.2f an %.2f sh %.2f sht %.2f cc %.2f ccg %.2f: cost %.4f aside %.3f", at, xx[0],xx[1],xx[2],xx[3],xx[4],xx[5],xx[6],xx[7],xx[8],xx[9], c, 100*sqrt(e2)); }
     if (!err)
         err = simplify(s, &w, r, at, &frozen, &error2, &full);
     for (int p = 0; p < DISNEY_N; p++)
@@ -944,8 +932,7 @@ static int search_new(struct search *s, const struct texel_scene *scene, const s
             s->texel[i] = -1;
     }
     parallel_for(s->n_threads, level->n, 16, colour_nodes, s);
-    labelling_bandwidth(s->bandwidth, (const float(*)[3])s->colour, level->n);
-    return 0;
+    return labelling_bandwidth(s->bandwidth, level, (const float(*)[3])s->colour);
 }
 
 int regions_find(struct regions *out, uint8_t *region_of, const struct texel_scene *scene, const struct level *level,
@@ -1045,10 +1032,11 @@ int regions_refine(const struct regions *r, uint8_t *region_of, const uint8_t *p
     if (!err) {
         float bandwidth[3];
         parallel_for(n_threads, level->n, 64, weigh_doubtful, &f);
-        labelling_bandwidth(bandwidth, (const float(*)[3])f.colour, level->n);
+        err = labelling_bandwidth(bandwidth, level, (const float(*)[3])f.colour);
         const struct labelling job = { .level = level, .n_labels = r->n, .stride = REGIONS_MAX, .evidence = f.evidence,
                                        .colour = (const float(*)[3])f.colour, .bandwidth = bandwidth };
-        err = labelling_find(region_of, &job);
+        if (!err)
+            err = labelling_find(region_of, &job);
     }
     for (int i = 0; f.worker && i < n_workers; i++)
         texel_worker_free(f.worker[i]);

@@ -181,6 +181,46 @@ static void gradient_of_a_texel_is_the_derivative_of_its_cost(void **state)
     }
 }
 
+// Each view left out in turn, the albedo found from the others.
+static void what_a_texel_would_cost_without_each_sample_is_what_leaving_it_out_says(void **state)
+{
+    (void)state;
+    const struct materials_input in = input_of(&d3);
+    const float theta[DISNEY_N] = { .2f, 0, .5f, .3f, 0, 0, 0, 0, 0, 0 };
+    struct materials_settings set = materials_defaults();
+    struct estimate e;
+    set.n_threads = 1;
+    assert_int_equal(estimate_new(&e, &in, &set), 0);
+    uint8_t *use = (uint8_t *)e.scene.use_view;
+    for (int k = 0; k < 10; k++) {
+        const int t = (int)((int64_t)k * d3.texels.n / 10 + 7);
+        struct texel_sums at = { 0 };
+        float albedo[3] = { .4f, .5f, .3f };
+        double left_out = 0;
+        for (int round = 0; round < 3; round++) {
+            at = (struct texel_sums){ 0 };
+            texel_fit_albedo(&e.scene, e.worker[0], t, 0, theta, albedo, 1, &at);
+        }
+        for (int v = 0; v < N_VIEWS; v++) {
+            if (!use[v])
+                continue;
+            float without[3];
+            struct texel_sums others = { 0 };
+            struct texel_error error = { 0 }, all = { 0 };
+            memcpy(without, albedo, sizeof(without));
+            use[v] = 0;
+            texel_fit_albedo(&e.scene, e.worker[0], t, 0, theta, without, 1, &others);
+            texel_measure(&e.scene, e.worker[0], t, theta, without, &error);
+            use[v] = 1;
+            texel_measure(&e.scene, e.worker[0], t, theta, without, &all);
+            left_out += all.cost - error.cost;
+        }
+        assert_true(left_out > 1.02 * at.cost);
+        assert_true(fabs(at.left_out_cost - left_out) < .02 * left_out);
+    }
+    estimate_free(&e);
+}
+
 // Shares of 0 and 1 are bits; where less of the lights arrives, what is seen takes a brighter albedo; light from elsewhere a darker one.
 static void soft_shadows_and_light_from_the_object_count_as_light(void **state)
 {
@@ -613,6 +653,7 @@ int main(void)
     const struct CMUnitTest tests[] = {
         cmocka_unit_test(packed_cholesky_solves),
         cmocka_unit_test(gradient_of_a_texel_is_the_derivative_of_its_cost),
+        cmocka_unit_test(what_a_texel_would_cost_without_each_sample_is_what_leaving_it_out_says),
         cmocka_unit_test(soft_shadows_and_light_from_the_object_count_as_light),
         cmocka_unit_test(a_step_by_pcg_is_that_of_the_dense_system),
         cmocka_unit_test(one_material_stays_one_and_is_found),
