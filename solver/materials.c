@@ -434,37 +434,8 @@ static void estimate_free(struct estimate *e)
     free((void *)e->scene.use_view);
     free((void *)e->scene.gain);
     free((void *)e->scene.indirect);
-    free((void *)e->scene.bend2);
     light_arrays_free(&e->scene.lights);
     levels_free(&e->levels);
-}
-
-// Squared curvature: how fast the normal turns, the mean over directions of what texels beside each other say.
-static float *find_bend(const struct texels *t, float width_m)
-{
-    float *bend2 = calloc((size_t)t->n + 1, sizeof(*bend2));
-    for (int i = 0; bend2 && i < t->n; i++) {
-        const int x = (int)t->pixel[i] % t->size, y = (int)t->pixel[i] / t->size;
-        float sum[2] = { 0 };
-        int n[2] = { 0 };
-        for (int side = 0; side < 4; side++) {
-            const int px = x + (side == 1) - (side == 0), py = y + (side == 3) - (side == 2);
-            const int32_t j = px < 0 || py < 0 || px >= t->size || py >= t->size ? -1 : t->index[py * t->size + px];
-            if (j < 0 || t->chart[j] != t->chart[i])
-                continue;
-            float turn2 = 0, way2 = 0;
-            for (int c = 0; c < 3; c++) {
-                turn2 += (t->normal[i][c] - t->normal[j][c]) * (t->normal[i][c] - t->normal[j][c]);
-                way2 += (t->position_m[i][c] - t->position_m[j][c]) * (t->position_m[i][c] - t->position_m[j][c]);
-            }
-            if (way2 > 0)
-                sum[side / 2] += turn2 / way2, n[side / 2]++;
-        }
-        for (int k = 0; k < 2; k++)
-            bend2[i] += n[k] ? .5f * sum[k] / (float)n[k] : 0;
-        bend2[i] *= 2 * width_m * width_m / 12; // of a box that wide the variance is a twelfth; alpha^2 is twice a lobe's
-    }
-    return bend2;
 }
 
 static int estimate_new(struct estimate *e, const struct materials_input *in, const struct materials_settings *set)
@@ -479,8 +450,6 @@ static int estimate_new(struct estimate *e, const struct materials_input *in, co
     e->scene.free_albedo = set->free_albedo, e->scene.weigh_grazing = set->weigh_grazing;
     uint8_t *use = calloc((size_t)s->n_views + 1, 1);
     e->scene.use_view = use;
-    if (getenv("BEND_MM"))
-        e->scene.bend2 = find_bend(in->texels, (float)atof(getenv("BEND_MM")) / 1000);
     e->n_samples = calloc((size_t)in->texels->n + 1, sizeof(*e->n_samples));
     e->n_workers = set->n_threads > 0 ? set->n_threads : parallel_n_cores();
     if (!use || !e->n_samples || light_arrays_new(&e->scene.lights, in->lights))

@@ -764,22 +764,32 @@ static int merge(struct search *s)
         for (int a = 0; !err && a < s->out->n; a++)
             for (int b = a + 1; !err && b < s->out->n; b++) {
                 struct witnesses both;
-                float theta[DISNEY_N], one[WITNESSES], other[WITNESSES];
-                uint16_t frozen = 0;
+                const float *start[] = { NULL, s->out->region[a].theta, s->out->region[b].theta };
+                const double allowed = known_to_differ(&s->out->region[a], &s->out->region[b]) ? worth_a_region : worth_a_doubtful_one;
+                float theta[DISNEY_N], tried[DISNEY_N], one[WITNESSES], other[WITNESSES];
+                uint16_t frozen = 0, tried_frozen = 0;
+                double worse = INFINITY;
                 call_both(&w[a], &w[b], &both);
-                for (int p = 0; p < DISNEY_N; p++)
-                    theta[p] = .5f * (s->out->region[a].theta[p] + s->out->region[b].theta[p]);
-                err = fit_either(s, &both, true, theta, &frozen);
-                if (!err)
-                    err = test(s, &w[a], theta, 0, -1, &error2, NULL, one);
-                if (!err)
-                    err = test(s, &w[b], theta, 0, -1, &error2, NULL, other);
+                for (int k = 0; !err && k < 3 && !(worse <= 1); k++) { // a wrong valley is no reason for two materials
+                    for (int p = 0; p < DISNEY_N; p++)
+                        tried[p] = start[k] ? start[k][p] : .5f * (start[1][p] + start[2][p]);
+                    err = fit_either(s, &both, false, tried, &tried_frozen);
+                    if (!err)
+                        err = test(s, &w[a], tried, 0, -1, &error2, NULL, one);
+                    if (!err)
+                        err = test(s, &w[b], tried, 0, -1, &error2, NULL, other);
+                    if (err)
+                        break;
+                    const double worse_a = how_much_worse(one, alone[a], w[a].n), worse_b = how_much_worse(other, alone[b], w[b].n);
+                    log_debug("regions: %d and %d of %d as one: views aside %.4f x, %.4f x; allowed %.1f", a, b, s->out->n, worse_a, worse_b, allowed);
+                    if (fmax(worse_a, worse_b) / allowed < worse) {
+                        worse = fmax(worse_a, worse_b) / allowed;
+                        frozen = tried_frozen;
+                        memcpy(theta, tried, sizeof(theta));
+                    }
+                }
                 if (err)
                     break;
-                const double worse_a = how_much_worse(one, alone[a], w[a].n), worse_b = how_much_worse(other, alone[b], w[b].n);
-                const double allowed = known_to_differ(&s->out->region[a], &s->out->region[b]) ? worth_a_region : worth_a_doubtful_one;
-                const double worse = fmax(worse_a, worse_b) / allowed;
-                log_debug("regions: %d and %d of %d as one: views aside %.4f x, %.4f x; allowed %.1f", a, b, s->out->n, worse_a, worse_b, allowed);
                 if (worse < least) {
                     least = worse, best_a = a, best_b = b, best_frozen = frozen;
                     memcpy(best_theta, theta, sizeof(theta));

@@ -110,27 +110,14 @@ static int observe(const struct texel_scene *s, struct texel_worker *w, int texe
     return n_used;
 }
 
-// The material as a sample sees it: the lobes of all normals of its footprint (LEAN mapping: Olano, Baker 2010). Returns d roughness seen / d roughness.
-static float see_material(const struct texel_scene *s, int texel, const float theta[DISNEY_N], const float albedo[3], struct shade_material *m)
-{
-    *m = (struct shade_material){ .variant = s->variant };
-    memcpy(m->theta, theta, sizeof(m->theta));
-    memcpy(m->albedo, albedo, sizeof(m->albedo));
-    const float r = theta[DISNEY_ROUGHNESS], bend2 = s->bend2 ? s->bend2[texel] : 0;
-    if (!(bend2 > 0))
-        return 1;
-    const float seen = fminf(sqrtf(sqrtf(r * r * r * r + bend2)), 1);
-    m->theta[DISNEY_ROUGHNESS] = seen;
-    return seen < 1 ? r * r * r / (seen * seen * seen) : 0;
-}
-
 // Jacobians of the observations, and their residuals; gain and indirect light are in.
 static void shade(const struct texel_scene *s, struct texel_worker *w, int texel, int n, const float theta[DISNEY_N],
                   const float albedo[3])
 {
     struct surface_point point;
-    struct shade_material m;
-    const float by_roughness = see_material(s, texel, theta, albedo, &m);
+    struct shade_material m = { .variant = s->variant };
+    memcpy(m.theta, theta, sizeof(m.theta));
+    memcpy(m.albedo, albedo, sizeof(m.albedo));
     surface_of_texel(&point, s->texels, texel);
     gather_lights(s, w, texel, &point);
     s->kernels->shade_jacobian_views(w->jacobian, n, &w->lit, &point, (const float(*)[3])w->v, &m);
@@ -138,7 +125,6 @@ static void shade(const struct texel_scene *s, struct texel_worker *w, int texel
         struct shade_jacobian *d = &w->jacobian[k];
         struct observation *o = &w->seen[k];
         for (int c = 0; c < 3; c++) {
-            d->theta[c][DISNEY_ROUGHNESS] *= by_roughness;
             if (s->indirect) {
                 const float E = s->indirect[texel][c], own = indirect_own(E);
                 float by_specular, by_metallic;
@@ -317,11 +303,12 @@ void texel_measure(const struct texel_scene *s, struct texel_worker *w, int texe
                    const float albedo[3], struct texel_error *out)
 {
     struct surface_point point;
-    struct shade_material m;
+    struct shade_material m = { .variant = s->variant };
     const int n = observe(s, w, texel, 0);
     if (!n)
         return;
-    see_material(s, texel, theta, albedo, &m);
+    memcpy(m.theta, theta, sizeof(m.theta));
+    memcpy(m.albedo, albedo, sizeof(m.albedo));
     surface_of_texel(&point, s->texels, texel);
     gather_lights(s, w, texel, &point);
     for (int k = 0; k < n; k++) {

@@ -21,7 +21,6 @@ struct texel_scene {
     const uint8_t *soft;          // [n_texels][lights.n] visible share x 255, in place of visible; or NULL
     const float *gain;            // [n_views] exposure factors, or NULL: 1
     const float (*indirect)[3];   // [n_texels] irradiance that other surfaces send, or NULL
-    const float *bend2;           // [n_texels] how much wider a sample sees the lobe, as alpha^2: its footprint has many normals; or NULL: 0
     const uint8_t *use_view;      // [n_views] 0: left out
     bool free_albedo;             // false: it stays as it is
     bool weigh_grazing;           // samples count less where the view grazes: min(1, 2 <n,v>)
