@@ -25,6 +25,7 @@ static const double least_share = .03;       // a smaller region is dissolved: w
 static const double worth_a_region = 1.10;   // squared error of views set aside, of one reflectance for two regions
 static const double worth_a_doubtful_one = 1.5; // the same where no parameter is known to differ: a fifth of the RMSE
 static const double certain = 3;             // standard deviations by which a parameter is known to differ
+static const double worth_a_metal = 1.5;     // the same where a dielectric would do: a little metal lets every texel choose its own specular colour
 static const double worth_a_parameter = .97; // the same with a parameter free per texel
 static const double worth_a_layer = 1.01;    // the same without clearcoat, sheen, ...
 static const double better_without = .99;
@@ -436,8 +437,8 @@ static void drop(struct search *s, int r)
     }
 }
 
-// As a dielectric or with what metal the samples want, whichever explains views set aside. A little metal lets every texel choose its own specular
-// colour, which passes for anything in the views that were fitted.
+// As a dielectric, or with what metal the samples want where views set aside are explained far better so: true metal, even a fifth of it, leaves a
+// dielectric with several times its squared error; under lights that are off a glaze with free specular colours gains a tenth or a quarter.
 static int fit_either(struct search *s, const struct witnesses *w, bool anywhere, float theta[DISNEY_N], uint16_t *frozen)
 {
     float dielectric[DISNEY_N];
@@ -452,7 +453,7 @@ static int fit_either(struct search *s, const struct witnesses *w, bool anywhere
         err = test(s, w, dielectric, 0, -1, &without, NULL, NULL);
     if (err)
         return err;
-    *frozen = without < better_without * with ? 1 << DISNEY_METALLIC : 0;
+    *frozen = without < worth_a_metal * with + rounding2 ? 1 << DISNEY_METALLIC : 0;
     if (*frozen)
         memcpy(theta, dielectric, sizeof(dielectric));
     return 0;
@@ -760,20 +761,19 @@ static int merge(struct search *s)
             if (!err)
                 err = region_uncertainty(s, &s->inner, &w[r], 0, &s->out->region[r]);
         }
-        uint16_t best_frozen = 0;
         for (int a = 0; !err && a < s->out->n; a++)
             for (int b = a + 1; !err && b < s->out->n; b++) {
                 struct witnesses both;
                 const float *start[] = { NULL, s->out->region[a].theta, s->out->region[b].theta };
                 const double allowed = known_to_differ(&s->out->region[a], &s->out->region[b]) ? worth_a_region : worth_a_doubtful_one;
                 float theta[DISNEY_N], tried[DISNEY_N], one[WITNESSES], other[WITNESSES];
-                uint16_t frozen = 0, tried_frozen = 0;
                 double worse = INFINITY;
                 call_both(&w[a], &w[b], &both);
-                for (int k = 0; !err && k < 3 && !(worse <= 1); k++) { // a wrong valley is no reason for two materials
+                for (int k = 0; !err && k < 6 && !(worse <= 1); k++) { // a wrong valley is no reason for two materials
+                    const uint16_t metal = k % 2 ? 1 << DISNEY_METALLIC : 0;
                     for (int p = 0; p < DISNEY_N; p++)
-                        tried[p] = start[k] ? start[k][p] : .5f * (start[1][p] + start[2][p]);
-                    err = fit_either(s, &both, false, tried, &tried_frozen);
+                        tried[p] = k / 2 ? start[k / 2][p] : .5f * (start[1][p] + start[2][p]);
+                    err = fit_shared(s, &s->inner, &both, metal, false, tried);
                     if (!err)
                         err = test(s, &w[a], tried, 0, -1, &error2, NULL, one);
                     if (!err)
@@ -784,14 +784,13 @@ static int merge(struct search *s)
                     log_debug("regions: %d and %d of %d as one: views aside %.4f x, %.4f x; allowed %.1f", a, b, s->out->n, worse_a, worse_b, allowed);
                     if (fmax(worse_a, worse_b) / allowed < worse) {
                         worse = fmax(worse_a, worse_b) / allowed;
-                        frozen = tried_frozen;
                         memcpy(theta, tried, sizeof(theta));
                     }
                 }
                 if (err)
                     break;
                 if (worse < least) {
-                    least = worse, best_a = a, best_b = b, best_frozen = frozen;
+                    least = worse, best_a = a, best_b = b;
                     memcpy(best_theta, theta, sizeof(theta));
                 }
             }
@@ -800,7 +799,6 @@ static int merge(struct search *s)
         log_debug("regions: %d and %d of %d become one", best_a, best_b, s->out->n);
         rename_region(s, best_b, best_a);
         memcpy(s->out->region[best_a].theta, best_theta, sizeof(best_theta));
-        s->frozen[best_a] = best_frozen;
         drop(s, best_b);
         err = fit_all(s, false);
         if (!err)
@@ -843,7 +841,7 @@ static int simplify(struct search *s, const struct witnesses *w, struct region *
         const bool plain_enough = !(r->theta[p] - plain[p] > 2 * unknown_misfit * r->std[p]);
         log_debug("regions: region %d without %s (%.3f +- %.3f): views aside %.4f -> %.4f %%", at, disney_parameter_names[p], (double)r->theta[p],
                   (double)r->std[p], 100 * sqrt(*error2), 100 * sqrt(error));
-        if (error < better_without * *error2 || (plain_enough && error < worth_a_layer * *error2 + rounding2)) {
+        if (error < (k ? better_without : worth_a_metal) * *error2 || (plain_enough && error < worth_a_layer * *error2 + rounding2)) {
             *frozen |= without[k];
             *error2 = error;
             memcpy(r->theta, simpler.theta, sizeof(r->theta));

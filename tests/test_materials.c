@@ -3,7 +3,9 @@
 #include "solver/lm.h"
 #include "solver/materials.c"
 #include "solver/random.h"
+#include "solver/surface.h"
 #include "solver/synth.h"
+#include "solver/take/half.h"
 #include "solver/visibility.h"
 #include "tests/scratch.h"
 #include "tests/truth.h"
@@ -399,6 +401,61 @@ static void lights_that_are_off_hide_no_material(void **state)
     assert_in_range(n_regions_under_lights_off(&d5, .02, 1), 3, REGIONS_MAX); // metal, rubber, and what is between
 }
 
+// What D3's cameras would see of another material, its albedo `dark` here and `light` there. Free what radiance points to.
+static void see_instead(struct samples *out, const struct studio *s, const float theta[DISNEY_N], float dark, float light)
+{
+    const struct kernels *kernels = kernels_select(KERNELS_ALL);
+    struct light_arrays lights;
+    struct lit lit;
+    *out = s->samples;
+    out->radiance = malloc((size_t)out->n * sizeof(*out->radiance));
+    out->flags = calloc((size_t)out->n, 1);
+    assert_int_equal(light_arrays_new(&lights, &s->truth.lights), 0);
+    assert_int_equal(lit_new(&lit, s->truth.lights.n), 0);
+    for (int t = 0; t < s->texels.n; t++) {
+        struct surface_point point;
+        struct shade_material m = { .variant = DISNEY_2017 };
+        memcpy(m.theta, theta, sizeof(m.theta));
+        for (int c = 0; c < 3; c++)
+            m.albedo[c] = random_uniform(1, 0, (uint64_t)(t / 40)) < .5 ? dark : light;
+        surface_of_texel(&point, &s->texels, t);
+        kernels->gather(&lit, &lights, &point, s->visibility.bits + (size_t)t * (size_t)s->visibility.words_per_texel, NULL);
+        for (int64_t i = s->samples.first[t]; i < s->samples.first[t + 1]; i++) {
+            float v[3], L[3];
+            samples_view_direction(&s->samples, &s->texels, t, s->samples.view[i], v);
+            kernels->shade(L, &lit, &point, v, &m);
+            for (int c = 0; c < 3; c++) {
+                out->radiance[i][c] = half_from_float(L[c]);
+                out->flags[i] |= L[c] >= 1 ? SAMPLE_CLIPPED : 0;
+            }
+        }
+    }
+    lit_free(&lit), light_arrays_free(&lights);
+}
+
+static void a_glaze_under_lights_that_are_off_is_no_half_metal(void **state)
+{
+    (void)state;
+    static const float glaze[DISNEY_N] = { [DISNEY_SPECULAR] = .65f, [DISNEY_ROUGHNESS] = .14f };
+    struct samples seen;
+    see_instead(&seen, &noiseless, glaze, .03f, .06f);
+    for (uint64_t seed = 1; seed <= 3; seed++) {
+        struct materials m;
+        struct lights off;
+        struct materials_input in = input_of(&noiseless);
+        struct materials_settings set = materials_defaults();
+        assert_int_equal(lights_off(&off, &noiseless.truth.lights, .05, seed), 0);
+        in.lights = &off, in.samples = &seen;
+        set.look = true;
+        assert_int_equal(materials_solve(&m, &in, &set), 0);
+        assert_int_equal(m.regions.n, 1);
+        assert_true(m.regions.region[0].theta[DISNEY_METALLIC] < .05f);
+        assert_true(fabsf(m.regions.region[0].theta[DISNEY_ROUGHNESS] - .14f) < .03f);
+        materials_free(&m), lights_free(&off);
+    }
+    free(seen.radiance), free(seen.flags);
+}
+
 static void what_is_said_to_be_known_is(void **state)
 {
     (void)state;
@@ -659,6 +716,7 @@ int main(void)
         cmocka_unit_test(one_material_stays_one_and_is_found),
         cmocka_unit_test(lights_that_are_off_make_no_second_material),
         cmocka_unit_test(lights_that_are_off_hide_no_material),
+        cmocka_unit_test(a_glaze_under_lights_that_are_off_is_no_half_metal),
         cmocka_unit_test(what_is_said_to_be_known_is),
         cmocka_unit_test(doubt_of_the_light_is_what_moving_it_changes),
         cmocka_unit_test(what_is_not_known_of_the_lights_is_not_known_of_the_albedo),
