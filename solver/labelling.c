@@ -1,6 +1,7 @@
 // solver/labelling.c - mean field over neighbours and over nodes of like colour.
 #include "solver/labelling.h"
 
+#include <assert.h>
 #include <errno.h>
 #include <math.h>
 #include <stdlib.h>
@@ -117,56 +118,69 @@ static void vote(const struct labelling *j, const float *share, const float *lik
         const float w = landmark[k] == i ? 0 : like[k];
         all += w;
         for (int r = 0; r < j->n_labels; r++)
-            sum[r] += w * share[landmark[k] * MOST_LABELS + r];
+            sum[r] += w * share[landmark[k] * j->n_labels + r];
     }
     for (int r = 0; r < j->n_labels; r++)
         nats[r] -= logf((sum[r] / all + any_colour * usual[r]) / usual[r]);
 }
 
+// Only one label is possible, or none: no company changes it.
+static bool is_decided(const struct labelling *j, int i)
+{
+    int n = 0;
+    for (int r = 0; r < j->n_labels; r++)
+        n += !isinf(j->evidence[(size_t)i * (size_t)j->stride + (size_t)r]);
+    return n < 2;
+}
+
 int labelling_find(uint8_t *label, const struct labelling *j)
 {
     const struct level *l = j->level;
-    const size_t n = (size_t)l->n + 1;
+    const size_t n = (size_t)l->n + 1, n_labels = (size_t)j->n_labels;
     int landmark[LANDMARKS];
     const int n_landmarks = j->votes ? choose_landmarks(j, landmark) : 0;
-    float *share = malloc(n * MOST_LABELS * sizeof(float)), *next = malloc(n * MOST_LABELS * sizeof(float));
+    float *share = malloc(n * n_labels * sizeof(float)), *next = malloc(n * n_labels * sizeof(float));
     float *like = malloc((n * (size_t)n_landmarks + 1) * sizeof(float));
-    float *edge = malloc(((size_t)l->first_neighbour[l->n] + 1) * sizeof(float));
-    const int err = share && next && like && edge ? 0 : -ENOMEM;
+    float *edge = calloc((size_t)l->first_neighbour[l->n] + 1, sizeof(float));
+    uint8_t *decided = malloc(n);
+    const int err = share && next && like && edge && decided ? 0 : -ENOMEM;
+    assert(j->n_labels <= MOST_LABELS);
     for (int i = 0; !err && i < l->n; i++) {
-        share_out(j->evidence + (size_t)i * (size_t)j->stride, j->n_labels, share + (size_t)i * MOST_LABELS);
-        for (int k = 0; k < n_landmarks; k++)
+        share_out(j->evidence + (size_t)i * (size_t)j->stride, j->n_labels, share + (size_t)i * n_labels);
+        decided[i] = is_decided(j, i);
+        for (int k = 0; k < n_landmarks && !decided[i]; k++)
             like[(size_t)i * (size_t)n_landmarks + (size_t)k] = likeness(j, i, landmark[k]);
-        for (int32_t m = l->first_neighbour[i]; m < l->first_neighbour[i + 1]; m++)
+        for (int32_t m = l->first_neighbour[i]; m < l->first_neighbour[i + 1] && !decided[i]; m++)
             edge[m] = agreement * (unlike + (1 - unlike) * likeness(j, i, l->neighbour[m]));
     }
     float moved = INFINITY;
     for (int sweep = 0; !err && sweep < MOST_SWEEPS && moved > settled; sweep++) {
         float usual[MOST_LABELS] = { 0 };
         for (int k = 0; k < n_landmarks; k++)
-            for (int r = 0; r < j->n_labels; r++)
-                usual[r] += (share[landmark[k] * MOST_LABELS + r] + 1e-3f) / (float)n_landmarks;
+            for (size_t r = 0; r < n_labels; r++)
+                usual[r] += (share[(size_t)landmark[k] * n_labels + r] + 1e-3f) / (float)n_landmarks;
         for (int i = 0; i < l->n; i++) {
             float nats[MOST_LABELS];
-            for (int r = 0; r < j->n_labels; r++) {
-                nats[r] = j->evidence[(size_t)i * (size_t)j->stride + (size_t)r];
+            if (decided[i])
+                continue;
+            for (size_t r = 0; r < n_labels; r++) {
+                nats[r] = j->evidence[(size_t)i * (size_t)j->stride + r];
                 for (int32_t m = l->first_neighbour[i]; m < l->first_neighbour[i + 1]; m++)
-                    nats[r] -= edge[m] * share[(size_t)l->neighbour[m] * MOST_LABELS + (size_t)r];
+                    nats[r] -= edge[m] * share[(size_t)l->neighbour[m] * n_labels + r];
             }
             if (n_landmarks && !isnan(j->colour[i][0]))
                 vote(j, share, like + (size_t)i * (size_t)n_landmarks, landmark, n_landmarks, usual, i, nats);
-            share_out(nats, j->n_labels, next + (size_t)i * MOST_LABELS);
+            share_out(nats, j->n_labels, next + (size_t)i * n_labels);
         }
         moved = 0;
         for (int i = 0; i < l->n; i++) // half way: no node and its neighbour change places for ever
-            for (int r = 0; r < j->n_labels; r++) {
-                float *now = share + (size_t)i * MOST_LABELS + r;
-                moved = fmaxf(moved, fabsf(next[(size_t)i * MOST_LABELS + (size_t)r] - *now));
-                *now = .5f * (*now + next[(size_t)i * MOST_LABELS + (size_t)r]);
+            for (size_t at = (size_t)i * n_labels; !decided[i] && at < ((size_t)i + 1) * n_labels; at++) {
+                moved = fmaxf(moved, fabsf(next[at] - share[at]));
+                share[at] = .5f * (share[at] + next[at]);
             }
     }
     for (int i = 0; !err && i < l->n; i++) {
-        const float *s = share + (size_t)i * MOST_LABELS;
+        const float *s = share + (size_t)i * n_labels;
         label[i] = 0;
         for (int r = 1; r < j->n_labels; r++)
             label[i] = s[r] > s[label[i]] ? (uint8_t)r : label[i];
@@ -175,5 +189,6 @@ int labelling_find(uint8_t *label, const struct labelling *j)
     free(next);
     free(like);
     free(edge);
+    free(decided);
     return err;
 }

@@ -9,7 +9,7 @@
 
 struct labelling {
     const struct level *level;
-    int n_labels, stride;       // n_labels <= stride
+    int n_labels, stride;       // n_labels <= stride, 8
     const float *evidence;      // [level n][stride] nats against each label; infinite: out of the question; all equal: nothing known
     const float (*colour)[3];   // [level n] logarithms; a NAN first: not known
     const float *bandwidth;     // [3] of luminance and two tints: colours so far apart are unlike (labelling_bandwidth)

@@ -992,10 +992,11 @@ static void weigh_doubtful(void *arg, int64_t begin, int64_t end, int worker)
         float cost[REGIONS_MAX];
         const int32_t first = l->first_delegate ? l->first_delegate[i] : 0, n = l->first_delegate ? l->first_delegate[i + 1] - first : 1;
         int n_samples = 0;
-        f->colour[i][0] = NAN;
-        if (f->candidates[i] && n)
-            if (!colour_of(f->scene, f->worker[worker], l->first_delegate ? l->delegate[first] : i, f->colour[i]))
-                f->colour[i][0] = NAN;
+        bool asked = f->candidates[i] && n > 0; // for its colour: by itself or beside one in doubt
+        for (int32_t m = l->first_neighbour[i]; n > 0 && m < l->first_neighbour[i + 1]; m++)
+            asked = asked || f->candidates[l->neighbour[m]];
+        if (!asked || !colour_of(f->scene, f->worker[worker], l->first_delegate ? l->delegate[first] : i, f->colour[i]))
+            f->colour[i][0] = NAN;
         for (int r = 0; r < f->r->n; r++) {
             struct texel_sums sums = { 0 };
             cost[r] = f->candidates[i] ? f->candidates[i] >> r & 1 ? 0 : INFINITY : f->region[i] == r ? 0 : INFINITY;
