@@ -116,6 +116,21 @@ static void a_colour_that_all_materials_have_says_nothing(void **state)
     assert_true(other < N / 100);
 }
 
+static void a_colour_that_only_one_node_has_says_nothing(void **state)
+{
+    (void)state;
+    make_square(0);
+    for (int i = 0; i < N; i++) {
+        paint(i, .2f, 7);
+        g.evidence[i][0] = 5;
+    }
+    const int odd = SIDE * SIDE / 2 + 5;
+    paint(odd, .7f, 7);
+    g.evidence[odd][0] = 0, g.evidence[odd][1] = .3f; // hardly any: its neighbours are stronger, though of another colour
+    find(true);
+    assert_int_equal(g.label[odd], 1);
+}
+
 static void what_is_out_of_the_question_is_not_chosen(void **state)
 {
     (void)state;
@@ -139,6 +154,7 @@ int main(void)
         cmocka_unit_test(a_border_lies_where_the_colour_changes),
         cmocka_unit_test(what_a_node_shows_of_itself_beats_its_company),
         cmocka_unit_test(a_colour_that_all_materials_have_says_nothing),
+        cmocka_unit_test(a_colour_that_only_one_node_has_says_nothing),
         cmocka_unit_test(what_is_out_of_the_question_is_not_chosen),
     };
     return cmocka_run_group_tests(tests, NULL, NULL);
