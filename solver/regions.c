@@ -1,6 +1,7 @@
 // solver/regions.c - dealing texels out to shared reflectances, merging those, and choosing what each texel may have for itself.
 #include "solver/regions.h"
 
+#include "solver/labelling.h"
 #include "solver/lm.h"
 #include "solver/packed.h"
 #include "solver/parallel.h"
@@ -24,6 +25,7 @@ static const double least_share = .03;       // a smaller region is dissolved: w
 static const double worth_a_region = 1.10;   // squared error of views set aside, of one reflectance for two regions
 static const double worth_a_doubtful_one = 1.5; // the same where no parameter is known to differ: a fifth of the RMSE
 static const double certain = 3;             // standard deviations by which a parameter is known to differ
+static const double worth_a_metal = 1.5;     // the same where a dielectric would do: a little metal lets every texel choose its own specular colour
 static const double worth_a_parameter = .97; // the same with a parameter free per texel
 static const double worth_a_layer = 1.01;    // the same without clearcoat, sheen, ...
 static const double better_without = .99;
@@ -46,9 +48,14 @@ struct search {
     struct texel_worker **worker;
     int n_workers, n_threads;
     uint8_t *region;                     // [level n]
-    float *cost;                         // [level n][REGIONS_MAX]
+    float *cost;                         // [level n][REGIONS_MAX] of a sample, in the mean
+    float *evidence;                     // the same as nats
+    int *n_samples;                      // [level n]
+    float (*colour)[3];                  // [level n] of a matt surface, logarithms; NAN: not known
+    float bandwidth[3];
     double hold;                         // draws what nothing determines towards plain, beside the sum of squares
     struct regions *out;
+    uint16_t frozen[REGIONS_MAX];        // of each region: metallic, or nothing
 };
 
 struct witnesses {
@@ -325,7 +332,8 @@ static void cost_nodes(void *arg, int64_t begin, int64_t end, int worker)
                 continue;
             memcpy(albedo, s->albedo[s->texel[i]], sizeof(albedo));
             texel_fit_albedo(s->scene, s->worker[worker], s->texel[i], 0, s->out->region[r].theta, albedo, 1, &sums);
-            s->cost[i * REGIONS_MAX + r] = (float)(sums.cost / fmax(sums.n, 1));
+            s->cost[i * REGIONS_MAX + r] = (float)(sums.left_out_cost / fmax(sums.n, 1));
+            s->n_samples[i] = sums.n;
         }
 }
 
@@ -335,30 +343,13 @@ static int by_float(const void *a, const void *b)
     return (x > y) - (x < y);
 }
 
-// Each node to the cheapest region; `unit`: what disagreeing with a neighbour costs.
-static void deal(const struct level *l, const float *cost, int n_regions, float unit, uint8_t *region)
+// Nats against each region of a texel whose errors have a variance of their own, unknown: n/2 log(sum of squares). Errors of a texel's samples go
+// together: lights, shape.
+static void weigh_evidence(const float *cost, int n_regions, int n_samples, float *evidence)
 {
-    for (int i = 0; i < l->n; i++) {
-        const float *c = cost + (size_t)i * REGIONS_MAX;
-        int best = 0;
-        for (int r = 1; r < n_regions; r++)
-            best = c[r] < c[best] ? r : best;
-        region[i] = (uint8_t)best;
-    }
-    for (int sweep = 0; sweep < 4; sweep++) // iterated conditional modes
-        for (int i = 0; i < l->n; i++) {
-            const float *c = cost + (size_t)i * REGIONS_MAX;
-            float best_cost = INFINITY;
-            int best = 0;
-            for (int r = 0; r < n_regions; r++) {
-                float sum = c[r];
-                for (int32_t m = l->first_neighbour[i]; m < l->first_neighbour[i + 1]; m++)
-                    sum += region[l->neighbour[m]] != r ? unit : 0;
-                if (sum < best_cost)
-                    best_cost = sum, best = r;
-            }
-            region[i] = (uint8_t)best;
-        }
+    static const float independent = .25f; // of its samples
+    for (int r = 0; r < n_regions; r++)
+        evidence[r] = isinf(cost[r]) ? INFINITY : .5f * independent * (float)n_samples * logf(cost[r] + (float)rounding2);
 }
 
 static int deal_out(struct search *s)
@@ -380,9 +371,44 @@ static int deal_out(struct search *s)
     qsort(least, (size_t)n, sizeof(float), by_float);
     const double median = n ? (double)least[n / 2] : 0; // half the squares of a sample's three channels
     s->hold = fmin(2 * median / 3 / plain_variance, first_hold);
-    deal(l, s->cost, s->out->n, .5f * (float)median, s->region);
     free(least);
-    return 0;
+    for (int i = 0; i < l->n; i++)
+        weigh_evidence(s->cost + (size_t)i * REGIONS_MAX, s->out->n, s->n_samples[i], s->evidence + (size_t)i * REGIONS_MAX);
+    const struct labelling job = { .level = l, .n_labels = s->out->n, .stride = REGIONS_MAX, .evidence = s->evidence,
+                                   .colour = (const float(*)[3])s->colour, .bandwidth = s->bandwidth, .votes = true };
+    return labelling_find(s->region, &job);
+}
+
+// A matt surface's albedo by the median of the samples: what most views see, whatever a few see mirrored. False: no light, no samples.
+static bool colour_of(const struct texel_scene *scene, struct texel_worker *worker, int texel, float colour[3])
+{
+    static const float matt[DISNEY_N] = { [DISNEY_ROUGHNESS] = 1 }, grey[3] = { .5f, .5f, .5f };
+    static const float least_albedo = .01f;
+    const struct texel_row *rows;
+    struct texel_scene plainly = *scene;
+    float of_sample[3][TEXEL_VIEWS_MAX];
+    int n[3] = { 0 };
+    plainly.robust_scale = 0;
+    const int n_rows = texel_rows(&plainly, worker, texel, matt, grey, &rows);
+    for (int k = 0; k < n_rows; k++)
+        for (int c = 0; c < 3; c++)
+            if (rows[k].J[DISNEY_N + c] > 1e-4f)
+                of_sample[c][n[c]++] = grey[c] - rows[k].residual / rows[k].J[DISNEY_N + c];
+    for (int c = 0; c < 3; c++) {
+        if (!n[c])
+            return false;
+        qsort(of_sample[c], (size_t)n[c], sizeof(float), by_float);
+        colour[c] = logf(fmaxf(of_sample[c][n[c] / 2], 0) + least_albedo);
+    }
+    return true;
+}
+
+static void colour_nodes(void *arg, int64_t begin, int64_t end, int worker)
+{
+    struct search *s = arg;
+    for (int64_t i = begin; i < end; i++)
+        if (s->texel[i] < 0 || !colour_of(s->scene, s->worker[worker], s->texel[i], s->colour[i]))
+            s->colour[i][0] = NAN;
 }
 
 static void count(struct search *s)
@@ -407,7 +433,30 @@ static void drop(struct search *s, int r)
     if (r != last) {
         rename_region(s, last, r);
         s->out->region[r] = s->out->region[last];
+        s->frozen[r] = s->frozen[last];
     }
+}
+
+// As a dielectric, or with what metal the samples want where views set aside are explained far better so: true metal, even a fifth of it, leaves a
+// dielectric with several times its squared error; under lights that are off a glaze with free specular colours gains a tenth or a quarter.
+static int fit_either(struct search *s, const struct witnesses *w, bool anywhere, float theta[DISNEY_N], uint16_t *frozen)
+{
+    float dielectric[DISNEY_N];
+    double with, without;
+    memcpy(dielectric, theta, sizeof(dielectric));
+    int err = fit_shared(s, &s->inner, w, 0, anywhere, theta);
+    if (!err)
+        err = fit_shared(s, &s->inner, w, 1 << DISNEY_METALLIC, anywhere, dielectric);
+    if (!err)
+        err = test(s, w, theta, 0, -1, &with, NULL, NULL);
+    if (!err)
+        err = test(s, w, dielectric, 0, -1, &without, NULL, NULL);
+    if (err)
+        return err;
+    *frozen = without < worth_a_metal * with + rounding2 ? 1 << DISNEY_METALLIC : 0;
+    if (*frozen)
+        memcpy(theta, dielectric, sizeof(dielectric));
+    return 0;
 }
 
 static int fit_all(struct search *s, bool anywhere)
@@ -416,7 +465,8 @@ static int fit_all(struct search *s, bool anywhere)
     for (int r = 0; !err && r < s->out->n; r++) {
         struct witnesses w;
         call_witnesses(s, 1u << r, &w);
-        err = fit_shared(s, &s->inner, &w, 0, anywhere, s->out->region[r].theta);
+        if (w.n)
+            err = fit_either(s, &w, anywhere, s->out->region[r].theta, &s->frozen[r]);
     }
     return err;
 }
@@ -655,7 +705,7 @@ static int region_uncertainty(struct search *s, const struct texel_scene *scene,
 }
 
 // By what factor the witnesses' errors grow from `alone` to `shared`: the mean over them of the logarithm, as texels are very unlike; and as
-// much less as could be chance (four standard errors).
+// much less as could be chance (two standard errors).
 static double how_much_worse(const float *shared, const float *alone, int n)
 {
     double sum = 0, squares = 0;
@@ -666,7 +716,7 @@ static double how_much_worse(const float *shared, const float *alone, int n)
     if (n < 2)
         return 1;
     const double mean = sum / n, variance = fmax(squares / n - mean * mean, 0) / (n - 1);
-    return exp(mean - 4 * sqrt(variance));
+    return exp(mean - 2 * sqrt(variance));
 }
 
 // Does some parameter of the two differ by more than is not known of it?
@@ -714,21 +764,31 @@ static int merge(struct search *s)
         for (int a = 0; !err && a < s->out->n; a++)
             for (int b = a + 1; !err && b < s->out->n; b++) {
                 struct witnesses both;
-                float theta[DISNEY_N], one[WITNESSES], other[WITNESSES];
+                const float *start[] = { NULL, s->out->region[a].theta, s->out->region[b].theta };
+                const double allowed = known_to_differ(&s->out->region[a], &s->out->region[b]) ? worth_a_region : worth_a_doubtful_one;
+                float theta[DISNEY_N], tried[DISNEY_N], one[WITNESSES], other[WITNESSES];
+                double worse = INFINITY;
                 call_both(&w[a], &w[b], &both);
-                for (int p = 0; p < DISNEY_N; p++)
-                    theta[p] = .5f * (s->out->region[a].theta[p] + s->out->region[b].theta[p]);
-                err = fit_shared(s, &s->inner, &both, 0, false, theta);
-                if (!err)
-                    err = test(s, &w[a], theta, 0, -1, &error2, NULL, one);
-                if (!err)
-                    err = test(s, &w[b], theta, 0, -1, &error2, NULL, other);
+                for (int k = 0; !err && k < 6 && !(worse <= 1); k++) { // a wrong valley is no reason for two materials
+                    const uint16_t metal = k % 2 ? 1 << DISNEY_METALLIC : 0;
+                    for (int p = 0; p < DISNEY_N; p++)
+                        tried[p] = k / 2 ? start[k / 2][p] : .5f * (start[1][p] + start[2][p]);
+                    err = fit_shared(s, &s->inner, &both, metal, false, tried);
+                    if (!err)
+                        err = test(s, &w[a], tried, 0, -1, &error2, NULL, one);
+                    if (!err)
+                        err = test(s, &w[b], tried, 0, -1, &error2, NULL, other);
+                    if (err)
+                        break;
+                    const double worse_a = how_much_worse(one, alone[a], w[a].n), worse_b = how_much_worse(other, alone[b], w[b].n);
+                    log_debug("regions: %d and %d of %d as one: views aside %.4f x, %.4f x; allowed %.1f", a, b, s->out->n, worse_a, worse_b, allowed);
+                    if (fmax(worse_a, worse_b) / allowed < worse) {
+                        worse = fmax(worse_a, worse_b) / allowed;
+                        memcpy(theta, tried, sizeof(theta));
+                    }
+                }
                 if (err)
                     break;
-                const double worse_a = how_much_worse(one, alone[a], w[a].n), worse_b = how_much_worse(other, alone[b], w[b].n);
-                const double allowed = known_to_differ(&s->out->region[a], &s->out->region[b]) ? worth_a_region : worth_a_doubtful_one;
-                const double worse = fmax(worse_a, worse_b) / allowed;
-                log_debug("regions: %d and %d of %d as one: views aside %.4f x, %.4f x; allowed %.1f", a, b, s->out->n, worse_a, worse_b, allowed);
                 if (worse < least) {
                     least = worse, best_a = a, best_b = b;
                     memcpy(best_theta, theta, sizeof(theta));
@@ -766,8 +826,12 @@ static int simplify(struct search *s, const struct witnesses *w, struct region *
         const int p = __builtin_ctz(without[k]); // the layer's amount; the other says how it looks
         double error;
         err = region_uncertainty(s, s->scene, w, *frozen, r);
-        if (!k)
+        if (!k && !err) {
             *full = *r;
+            err = region_uncertainty(s, s->scene, w, 0, full);
+        }
+        if (*frozen & without[k])
+            continue;
         if (!err)
             err = fit_shared(s, &s->inner, w, *frozen | without[k], false, simpler.theta);
         if (!err)
@@ -777,7 +841,7 @@ static int simplify(struct search *s, const struct witnesses *w, struct region *
         const bool plain_enough = !(r->theta[p] - plain[p] > 2 * unknown_misfit * r->std[p]);
         log_debug("regions: region %d without %s (%.3f +- %.3f): views aside %.4f -> %.4f %%", at, disney_parameter_names[p], (double)r->theta[p],
                   (double)r->std[p], 100 * sqrt(*error2), 100 * sqrt(error));
-        if (error < better_without * *error2 || (plain_enough && error < worth_a_layer * *error2 + rounding2)) {
+        if (error < (k ? better_without : worth_a_metal) * *error2 || (plain_enough && error < worth_a_layer * *error2 + rounding2)) {
             *frozen |= without[k];
             *error2 = error;
             memcpy(r->theta, simpler.theta, sizeof(r->theta));
@@ -793,9 +857,9 @@ static int choose_freedom(struct search *s, struct region *r, int at)
     struct witnesses w;
     struct region full = { 0 };
     double error2 = 0, std;
-    uint16_t free_mask = 0, frozen = 0;
+    uint16_t free_mask = 0, frozen = s->frozen[at];
     call_witnesses(s, 1u << at, &w);
-    struct shared_fit first = { .s = s, .scene = &s->inner, .w = &w };
+    struct shared_fit first = { .s = s, .scene = &s->inner, .w = &w, .frozen = frozen };
     double cost;
     int err = w.n ? fit_from(&first, r->theta, 100, 1e-8, r->theta, &cost) : 0; // to the end: clearcoat against sheen is a long valley
     if (!err)
@@ -841,6 +905,9 @@ static void search_free(struct search *s)
     free((void *)s->aside.use_view);
     free(s->texel);
     free(s->cost);
+    free(s->evidence);
+    free(s->n_samples);
+    free(s->colour);
 }
 
 static int search_new(struct search *s, const struct texel_scene *scene, const struct level *level)
@@ -852,9 +919,12 @@ static int search_new(struct search *s, const struct texel_scene *scene, const s
     s->inner.use_view = inner, s->aside.use_view = aside;
     s->texel = malloc(((size_t)level->n + 1) * sizeof(*s->texel));
     s->cost = malloc(((size_t)level->n + 1) * REGIONS_MAX * sizeof(float));
+    s->evidence = malloc(((size_t)level->n + 1) * REGIONS_MAX * sizeof(float));
+    s->n_samples = calloc((size_t)level->n + 1, sizeof(*s->n_samples));
+    s->colour = malloc(((size_t)level->n + 1) * sizeof(*s->colour));
     s->n_workers = s->n_threads > 0 ? s->n_threads : parallel_n_cores();
     s->worker = calloc((size_t)s->n_workers, sizeof(*s->worker));
-    if (!inner || !aside || !s->texel || !s->cost || !s->worker)
+    if (!inner || !aside || !s->texel || !s->cost || !s->evidence || !s->n_samples || !s->colour || !s->worker)
         return -ENOMEM;
     for (int i = 0; i < s->n_workers; i++)
         if (texel_worker_new(&s->worker[i], scene))
@@ -869,7 +939,8 @@ static int search_new(struct search *s, const struct texel_scene *scene, const s
         if (s->texel[i] >= 0 && scene->samples->first[s->texel[i]] == scene->samples->first[s->texel[i] + 1])
             s->texel[i] = -1;
     }
-    return 0;
+    parallel_for(s->n_threads, level->n, 16, colour_nodes, s);
+    return labelling_bandwidth(s->bandwidth, level, (const float(*)[3])s->colour);
 }
 
 int regions_find(struct regions *out, uint8_t *region_of, const struct texel_scene *scene, const struct level *level,
@@ -908,21 +979,27 @@ struct refinement {
     const float (*albedo)[3];
     uint8_t *region;
     uint8_t *candidates; // [level n] a bit per region; 0: no doubt
-    float *cost;         // [level n][REGIONS_MAX]
+    float *evidence;     // [level n][REGIONS_MAX]
+    float (*colour)[3];
     struct texel_worker **worker;
 };
 
-static void cost_doubtful(void *arg, int64_t begin, int64_t end, int worker)
+static void weigh_doubtful(void *arg, int64_t begin, int64_t end, int worker)
 {
     const struct refinement *f = arg;
     const struct level *l = f->level;
     for (int i = (int)begin; i < (int)end; i++) {
-        float *cost = f->cost + (size_t)i * REGIONS_MAX;
-        for (int r = 0; r < f->r->n; r++)
-            cost[r] = f->candidates[i] ? (f->candidates[i] >> r & 1 ? 0 : INFINITY) : (f->region[i] == r ? 0 : INFINITY);
+        float cost[REGIONS_MAX];
         const int32_t first = l->first_delegate ? l->first_delegate[i] : 0, n = l->first_delegate ? l->first_delegate[i + 1] - first : 1;
-        for (int r = 0; f->candidates[i] && r < f->r->n; r++) {
+        int n_samples = 0;
+        bool asked = f->candidates[i] && n > 0; // for its colour: by itself or beside one in doubt
+        for (int32_t m = l->first_neighbour[i]; n > 0 && m < l->first_neighbour[i + 1]; m++)
+            asked = asked || f->candidates[l->neighbour[m]];
+        if (!asked || !colour_of(f->scene, f->worker[worker], l->first_delegate ? l->delegate[first] : i, f->colour[i]))
+            f->colour[i][0] = NAN;
+        for (int r = 0; r < f->r->n; r++) {
             struct texel_sums sums = { 0 };
+            cost[r] = f->candidates[i] ? f->candidates[i] >> r & 1 ? 0 : INFINITY : f->region[i] == r ? 0 : INFINITY;
             for (int32_t d = 0; d < n && (f->candidates[i] >> r & 1); d++) {
                 const int32_t t = l->first_delegate ? l->delegate[first + d] : i;
                 float albedo[3];
@@ -930,8 +1007,9 @@ static void cost_doubtful(void *arg, int64_t begin, int64_t end, int worker)
                 texel_fit_albedo(f->scene, f->worker[worker], t, 0, f->r->region[r].theta, albedo, 1, &sums);
             }
             if (f->candidates[i] >> r & 1)
-                cost[r] = (float)(sums.cost / fmax(sums.n, 1));
+                cost[r] = (float)(sums.left_out_cost / fmax(sums.n, 1)), n_samples = sums.n;
         }
+        weigh_evidence(cost, f->r->n, n_samples, f->evidence + (size_t)i * REGIONS_MAX);
     }
 }
 
@@ -941,9 +1019,10 @@ int regions_refine(const struct regions *r, uint8_t *region_of, const uint8_t *p
     const size_t n = (size_t)level->n + 1;
     const int n_workers = n_threads > 0 ? n_threads : parallel_n_cores();
     struct refinement f = { .r = r, .scene = scene, .level = level, .albedo = albedo, .region = region_of,
-                            .candidates = calloc(n, 1), .cost = malloc(n * REGIONS_MAX * sizeof(float)),
+                            .candidates = calloc(n, 1), .evidence = malloc(n * REGIONS_MAX * sizeof(float)),
+                            .colour = malloc(n * sizeof(*f.colour)),
                             .worker = calloc((size_t)n_workers, sizeof(*f.worker)) };
-    int err = f.candidates && f.cost && f.worker ? 0 : -ENOMEM;
+    int err = f.candidates && f.evidence && f.colour && f.worker ? 0 : -ENOMEM;
     for (int i = 0; !err && i < n_workers; i++)
         err = texel_worker_new(&f.worker[i], scene);
     for (int i = 0; i < level->n; i++)
@@ -960,22 +1039,19 @@ int regions_refine(const struct regions *r, uint8_t *region_of, const uint8_t *p
         f.candidates[i] = (uint8_t)(around & (around - 1) ? around : 0);
     }
     if (!err) {
-        float unit = 0; // from the texels in doubt: the mean of their least costs
-        int n_doubtful = 0;
-        parallel_for(n_threads, level->n, 64, cost_doubtful, &f);
-        for (int i = 0; i < level->n; i++) {
-            float least = INFINITY;
-            for (int k = 0; f.candidates[i] && k < r->n; k++)
-                least = fminf(least, f.cost[(size_t)i * REGIONS_MAX + (size_t)k]);
-            if (f.candidates[i])
-                unit += least, n_doubtful++;
-        }
-        deal(level, f.cost, r->n, n_doubtful ? .25f * unit / (float)n_doubtful : 0, region_of);
+        float bandwidth[3];
+        parallel_for(n_threads, level->n, 64, weigh_doubtful, &f);
+        err = labelling_bandwidth(bandwidth, level, (const float(*)[3])f.colour);
+        const struct labelling job = { .level = level, .n_labels = r->n, .stride = REGIONS_MAX, .evidence = f.evidence,
+                                       .colour = (const float(*)[3])f.colour, .bandwidth = bandwidth };
+        if (!err)
+            err = labelling_find(region_of, &job);
     }
     for (int i = 0; f.worker && i < n_workers; i++)
         texel_worker_free(f.worker[i]);
     free(f.worker);
     free(f.candidates);
-    free(f.cost);
+    free(f.evidence);
+    free(f.colour);
     return err;
 }

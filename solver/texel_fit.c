@@ -175,6 +175,25 @@ static double cost_of(const struct texel_scene *s, const struct observation *o)
     return (double)o->base * d * d / (1 + sqrt(1 + d * d / (scale * scale)));
 }
 
+// Where the albedo is free each sample has pulled it to itself by its share h of what is known: without it, its residual is r / (1 - h). An
+// albedo at a bound stays where it is.
+static double left_out_cost(const struct texel_scene *s, const struct texel_worker *w, int n, const float albedo[3])
+{
+    static const float least_left = .02f; // a residual grows to no more than fifty times
+    double own2[3] = { 0 }, sum = 0;
+    for (int c = 0; c < 3 && s->free_albedo; c++)
+        for (int k = 0; k < n && albedo[c] > 0 && albedo[c] < most_albedo; k++)
+            own2[c] += is_silent(&w->seen[k], c) ? 0 : (double)(w->weight[k] * w->seen[k].own[c] * w->seen[k].own[c]);
+    for (int k = 0; k < n; k++) {
+        struct observation o = w->seen[k];
+        for (int c = 0; c < 3; c++)
+            if (own2[c] > 1e-9)
+                o.r[c] /= fmaxf(1 - (float)((double)(w->weight[k] * o.own[c] * o.own[c]) / own2[c]), least_left);
+        sum += cost_of(s, &o);
+    }
+    return sum;
+}
+
 // Best albedo for these weights; residuals follow. Returns the largest relative change.
 static float solve_albedo(struct texel_worker *w, int n, float albedo[3])
 {
@@ -241,6 +260,7 @@ static int fit_and_add(const struct texel_scene *s, struct texel_worker *w, int 
         out->cost += scale * cost_of(s, &w->seen[k]);
         out->distance += (double)distance_of(&w->seen[k]);
     }
+    out->left_out_cost += n ? scale * left_out_cost(s, w, n, albedo) : 0;
     out->n += n;
     return n;
 }

@@ -34,6 +34,7 @@ void texel_worker_free(struct texel_worker *w);                               //
 // 1/2 sum of weight |L - o|^2 over the samples in use, its gradient and Gauss-Newton matrix by theta.
 struct texel_sums {
     double cost;
+    double left_out_cost;      // the same of every sample under the albedo that the others would have
     double distance;           // sum of |L - o|
     int n;                     // samples
     double H[THETA_PACKED], g[DISNEY_N];
@@ -43,7 +44,7 @@ struct texel_sums {
 // without light, gives zeros. Adds `scale` times the sums.
 void texel_fit(const struct texel_scene *s, struct texel_worker *w, int texel, int most_views, const float theta[DISNEY_N],
                float albedo[3], double scale, struct texel_sums *out);
-// The same where theta stays as it is: only the albedo, cost, distance and n.
+// The same where theta stays as it is: only the albedo, the costs, distance and n.
 void texel_fit_albedo(const struct texel_scene *s, struct texel_worker *w, int texel, int most_views, const float theta[DISNEY_N],
                       float albedo[3], double scale, struct texel_sums *out);
 // The same cost at a fixed albedo, without derivatives; and for the RMSE of SOLVER.md 5 the sum of |clip(L) - clip(o)|^2, clip to [0,1].

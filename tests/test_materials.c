@@ -3,7 +3,9 @@
 #include "solver/lm.h"
 #include "solver/materials.c"
 #include "solver/random.h"
+#include "solver/surface.h"
 #include "solver/synth.h"
+#include "solver/take/half.h"
 #include "solver/visibility.h"
 #include "tests/scratch.h"
 #include "tests/truth.h"
@@ -179,6 +181,46 @@ static void gradient_of_a_texel_is_the_derivative_of_its_cost(void **state)
         }
         estimate_free(&e);
     }
+}
+
+// Each view left out in turn, the albedo found from the others.
+static void what_a_texel_would_cost_without_each_sample_is_what_leaving_it_out_says(void **state)
+{
+    (void)state;
+    const struct materials_input in = input_of(&d3);
+    const float theta[DISNEY_N] = { .2f, 0, .5f, .3f, 0, 0, 0, 0, 0, 0 };
+    struct materials_settings set = materials_defaults();
+    struct estimate e;
+    set.n_threads = 1;
+    assert_int_equal(estimate_new(&e, &in, &set), 0);
+    uint8_t *use = (uint8_t *)e.scene.use_view;
+    for (int k = 0; k < 10; k++) {
+        const int t = (int)((int64_t)k * d3.texels.n / 10 + 7);
+        struct texel_sums at = { 0 };
+        float albedo[3] = { .4f, .5f, .3f };
+        double left_out = 0;
+        for (int round = 0; round < 3; round++) {
+            at = (struct texel_sums){ 0 };
+            texel_fit_albedo(&e.scene, e.worker[0], t, 0, theta, albedo, 1, &at);
+        }
+        for (int v = 0; v < N_VIEWS; v++) {
+            if (!use[v])
+                continue;
+            float without[3];
+            struct texel_sums others = { 0 };
+            struct texel_error error = { 0 }, all = { 0 };
+            memcpy(without, albedo, sizeof(without));
+            use[v] = 0;
+            texel_fit_albedo(&e.scene, e.worker[0], t, 0, theta, without, 1, &others);
+            texel_measure(&e.scene, e.worker[0], t, theta, without, &error);
+            use[v] = 1;
+            texel_measure(&e.scene, e.worker[0], t, theta, without, &all);
+            left_out += all.cost - error.cost;
+        }
+        assert_true(left_out > 1.02 * at.cost);
+        assert_true(fabs(at.left_out_cost - left_out) < .02 * left_out);
+    }
+    estimate_free(&e);
 }
 
 // Shares of 0 and 1 are bits; where less of the lights arrives, what is seen takes a brighter albedo; light from elsewhere a darker one.
@@ -357,6 +399,61 @@ static void lights_that_are_off_hide_no_material(void **state)
 {
     (void)state;
     assert_in_range(n_regions_under_lights_off(&d5, .02, 1), 3, REGIONS_MAX); // metal, rubber, and what is between
+}
+
+// What D3's cameras would see of another material, its albedo `dark` here and `light` there. Free what radiance points to.
+static void see_instead(struct samples *out, const struct studio *s, const float theta[DISNEY_N], float dark, float light)
+{
+    const struct kernels *kernels = kernels_select(KERNELS_ALL);
+    struct light_arrays lights;
+    struct lit lit;
+    *out = s->samples;
+    out->radiance = malloc((size_t)out->n * sizeof(*out->radiance));
+    out->flags = calloc((size_t)out->n, 1);
+    assert_int_equal(light_arrays_new(&lights, &s->truth.lights), 0);
+    assert_int_equal(lit_new(&lit, s->truth.lights.n), 0);
+    for (int t = 0; t < s->texels.n; t++) {
+        struct surface_point point;
+        struct shade_material m = { .variant = DISNEY_2017 };
+        memcpy(m.theta, theta, sizeof(m.theta));
+        for (int c = 0; c < 3; c++)
+            m.albedo[c] = random_uniform(1, 0, (uint64_t)(t / 40)) < .5 ? dark : light;
+        surface_of_texel(&point, &s->texels, t);
+        kernels->gather(&lit, &lights, &point, s->visibility.bits + (size_t)t * (size_t)s->visibility.words_per_texel, NULL);
+        for (int64_t i = s->samples.first[t]; i < s->samples.first[t + 1]; i++) {
+            float v[3], L[3];
+            samples_view_direction(&s->samples, &s->texels, t, s->samples.view[i], v);
+            kernels->shade(L, &lit, &point, v, &m);
+            for (int c = 0; c < 3; c++) {
+                out->radiance[i][c] = half_from_float(L[c]);
+                out->flags[i] |= L[c] >= 1 ? SAMPLE_CLIPPED : 0;
+            }
+        }
+    }
+    lit_free(&lit), light_arrays_free(&lights);
+}
+
+static void a_glaze_under_lights_that_are_off_is_no_half_metal(void **state)
+{
+    (void)state;
+    static const float glaze[DISNEY_N] = { [DISNEY_SPECULAR] = .65f, [DISNEY_ROUGHNESS] = .14f };
+    struct samples seen;
+    see_instead(&seen, &noiseless, glaze, .03f, .06f);
+    for (uint64_t seed = 1; seed <= 3; seed++) {
+        struct materials m;
+        struct lights off;
+        struct materials_input in = input_of(&noiseless);
+        struct materials_settings set = materials_defaults();
+        assert_int_equal(lights_off(&off, &noiseless.truth.lights, .05, seed), 0);
+        in.lights = &off, in.samples = &seen;
+        set.look = true;
+        assert_int_equal(materials_solve(&m, &in, &set), 0);
+        assert_int_equal(m.regions.n, 1);
+        assert_true(m.regions.region[0].theta[DISNEY_METALLIC] < .05f);
+        assert_true(fabsf(m.regions.region[0].theta[DISNEY_ROUGHNESS] - .14f) < .03f);
+        materials_free(&m), lights_free(&off);
+    }
+    free(seen.radiance), free(seen.flags);
 }
 
 static void what_is_said_to_be_known_is(void **state)
@@ -613,11 +710,13 @@ int main(void)
     const struct CMUnitTest tests[] = {
         cmocka_unit_test(packed_cholesky_solves),
         cmocka_unit_test(gradient_of_a_texel_is_the_derivative_of_its_cost),
+        cmocka_unit_test(what_a_texel_would_cost_without_each_sample_is_what_leaving_it_out_says),
         cmocka_unit_test(soft_shadows_and_light_from_the_object_count_as_light),
         cmocka_unit_test(a_step_by_pcg_is_that_of_the_dense_system),
         cmocka_unit_test(one_material_stays_one_and_is_found),
         cmocka_unit_test(lights_that_are_off_make_no_second_material),
         cmocka_unit_test(lights_that_are_off_hide_no_material),
+        cmocka_unit_test(a_glaze_under_lights_that_are_off_is_no_half_metal),
         cmocka_unit_test(what_is_said_to_be_known_is),
         cmocka_unit_test(doubt_of_the_light_is_what_moving_it_changes),
         cmocka_unit_test(what_is_not_known_of_the_lights_is_not_known_of_the_albedo),
