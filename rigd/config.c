@@ -125,7 +125,7 @@ static const struct key panorama_keys[] = {
     { "meter", SECONDS, FIELD(config, panorama.meter_s), 1e-5, 60, false },
     { "shortest", SECONDS, FIELD(config, panorama.shortest_s), 1e-5, 60, false },
     { "longest", SECONDS, FIELD(config, panorama.longest_s), 1e-5, 60, false },
-    { "frames_max", INTEGER, FIELD(config, panorama.frames_max), 2, 32, false },
+    { "frames_max", INTEGER, FIELD(config, panorama.frames_max), 2, CONFIG_FRAMES_MAX, false },
     { "settle_ms", UNSIGNED, FIELD(config, panorama.settle_ms), 0, 60000, false },
     { "neutral_density_ev", NUMBER, FIELD(config, panorama.neutral_density_ev), 0, 40, false },
 };
@@ -269,6 +269,18 @@ static void begin_section(struct reader *r, const char *name)
     r->section = BAD_SECTION;
 }
 
+// In a list of stops a semicolon is a separator; inih takes one after a blank for the beginning of a comment, and would cut it there.
+static void join_stops(char *line)
+{
+    char *to = line;
+    if (strncmp(line, "stops", 5) || !strchr(" \t=:", line[5]))
+        return;
+    for (const char *from = line; *from; from++)
+        if (from[strspn(from, " \t")] != ';' || *from == ';')
+            *to++ = *from;
+    *to = 0;
+}
+
 // inih asks for the next line here.
 static char *next_line(char *out, int room, void *arg)
 {
@@ -317,6 +329,7 @@ static char *next_line(char *out, int room, void *arg)
         complain(r, r->line, "found neither 'key = value', [section] nor ; comment");
         strcpy(out, "\n");
     }
+    join_stops(out);
     return out;
 }
 
@@ -813,7 +826,7 @@ static void set_defaults(struct config *c)
     p->overlap = .25;
     p->meter_s = 1. / 60;
     p->shortest_s = 1. / 8000;
-    p->longest_s = 15;
+    p->longest_s = 4;
     p->frames_max = 12;
     p->settle_ms = 800;
     struct trigger_config *t = &c->trigger;

@@ -7,7 +7,7 @@
 #include "rigd/camera.h"
 #include "rigd/lens.h"
 
-enum { CONFIG_CAMERAS_MAX = 256, CONFIG_NONE = -1, CONFIG_STOPS_MAX = 64 };
+enum { CONFIG_CAMERAS_MAX = 256, CONFIG_NONE = -1, CONFIG_STOPS_MAX = 64, CONFIG_FRAMES_MAX = 32 };
 
 struct config_camera {       // [camera "A01"]
     char name[24];           // letters, digits, - and _: it names files
@@ -88,7 +88,7 @@ struct panorama_config {     // [panorama]
     struct config_stop stop[CONFIG_STOPS_MAX];
     double meter_s;          // first exposure of each stop; labels as on the dial, as in setting.shutter
     double shortest_s, longest_s; // no exposure beyond
-    int frames_max;          // per stop
+    int frames_max;          // per stop; at most CONFIG_FRAMES_MAX
     uint32_t settle_ms;      // from the head's rest to the first exposure
     double neutral_density_ev; // of a filter in front of the lens
 };

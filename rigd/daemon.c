@@ -84,6 +84,7 @@ struct waiter {
 struct daemon {
     struct config config;
     char takes_dir[300], worker_path[PATH_MAX];
+    char panorama_take[96]; // the newest there is; ""
     bool once, once_started, to_journal, stopping;
     int exit_code;
     struct rig *rig;
@@ -249,11 +250,26 @@ static void done_commit(struct daemon *d, struct job *j)
     rig_committed(d->rig, now_ns(), j->err);
 }
 
+static int write_plan(const char *dir, const char *text)
+{
+    struct atomic_file f;
+    char path[700];
+    snprintf(path, sizeof(path), "%s/panorama/panorama.json", dir);
+    const int err = atomic_file_open(&f, path);
+    if (err)
+        return err;
+    fprintf(f.stream, "%s\n", text); // commit looks at ferror
+    return atomic_file_commit(&f);
+}
+
 static void work_manifest(struct job *j)
 {
     int n_removed = 0;
     ledger_remove_parts(j->dir, &n_removed); // of workers that died: all copying is over
-    j->err = manifest_write(j->dir, j->known, j->n_known, j->value);
+    if (j->text)
+        j->err = write_plan(j->dir, j->text);
+    if (!j->err)
+        j->err = manifest_write(j->dir, j->known, j->n_known, j->value);
 }
 
 static void done_manifest(struct daemon *d, struct job *j)
@@ -503,6 +519,12 @@ static void on_trigger_broken(void *arg, int err)
     sd_event_source_set_enabled(d->trigger_timer, SD_EVENT_ONESHOT);
 }
 
+static void on_head_arrived(void *arg, int err)
+{
+    struct daemon *d = arg;
+    rig_head_arrived(d->rig, now_ns(), err);
+}
+
 static int on_trigger(sd_event_source *source, int fd, uint32_t events, void *arg)
 {
     struct daemon *d = arg;
@@ -517,7 +539,7 @@ static int open_the_trigger(sd_event_source *source, uint64_t usec, void *arg)
     static const char *const kinds[] = { "software (unsynchronised)", "gpio", "usb", "simulated" };
     (void)usec;
     d->host = (struct trigger_host){ .fired = on_fired, .feedback = on_feedback, .button = on_button, .press_camera = on_press_camera,
-                                      .broken = on_trigger_broken, .arg = d };
+                                      .broken = on_trigger_broken, .head_arrived = on_head_arrived, .arg = d };
     d->trigger_io = sd_event_source_disable_unref(d->trigger_io);
     trigger_close(d->trigger);
     d->trigger = NULL;
@@ -544,7 +566,7 @@ static void fire(struct daemon *d, const struct trigger_shot *shot)
 
 // ---- takes ---------------------------------------------------------------------------------------------------------------------------------
 
-static int capture(struct daemon *d, const char *name, bool without_missing, char *why)
+static int begin_take(struct daemon *d, enum take_kind kind, const char *name, bool without_missing, char *why)
 {
     char plain[41], id[96], created[40], stamp[40];
     const int64_t utc = utc_ms();
@@ -558,9 +580,24 @@ static int capture(struct daemon *d, const char *name, bool without_missing, cha
     strftime(created, sizeof(created), "%Y-%m-%dT%H:%M:%SZ", &tm);
     strftime(stamp, sizeof(stamp), "%Y%m%dT%H%M%S", &tm);
     snprintf(id, sizeof(id), "%s%03d_%s", stamp, (int)(utc % 1000), plain);
-    const struct rig_take take = { .id = id, .name = plain, .created = created, .utc_ms = utc, .takes_dir = d->takes_dir };
-    d->take_began_ns = now_ns();
-    return rig_capture(d->rig, now_ns(), &take, without_missing, why);
+    const struct rig_take take = { .id = id, .name = plain, .created = created, .utc_ms = utc, .takes_dir = d->takes_dir,
+                                   .panorama_take = kind == TAKE_CAPTURE ? d->panorama_take : NULL };
+    const int err = kind == TAKE_PANORAMA ? rig_panorama(d->rig, now_ns(), &take, why) : rig_capture(d->rig, now_ns(), &take, without_missing, why);
+    if (!err)
+        d->take_began_ns = now_ns();
+    return err;
+}
+
+static int capture(struct daemon *d, const char *name, bool without_missing, char *why)
+{
+    return begin_take(d, TAKE_CAPTURE, name, without_missing, why);
+}
+
+// Ids begin with their time.
+static void know_panorama(struct daemon *d, const struct ledger *l)
+{
+    if (l->kind == TAKE_PANORAMA && (l->state == TAKE_VERIFIED || l->state == TAKE_DEVELOPED || l->state == TAKE_SOLVED) && strcmp(l->id, d->panorama_take) > 0)
+        snprintf(d->panorama_take, sizeof(d->panorama_take), "%s", l->id);
 }
 
 static void count_take(struct daemon *d, const struct ledger *l)
@@ -590,6 +627,7 @@ static void take_is_done(struct daemon *d)
     struct json *report = describe_take(l, false);
     const double seconds = 1e-9 * (double)(now_ns() - d->take_began_ns);
     count_take(d, l);
+    know_panorama(d, l);
     json_set_number(report, "seconds", seconds);
     log_info("take %s: %s after %.2f s%s%s", l->id, take_state_name(l->state), seconds, l->reason[0] ? ": " : "", l->reason);
     control_reply(d->control, d->resuming ? d->resume_token : d->take_token, report);
@@ -639,7 +677,7 @@ static void done_reconcile(struct daemon *d, struct job *j)
     if (err)
         snprintf(why, sizeof(why), "its ledger or its frames cannot be read: %s; see the journal", strerror(-err));
     else
-        err = rig_resume(d->rig, now_ns(), &j->ledger, d->takes_dir, why);
+        err = rig_resume(d->rig, now_ns(), &j->ledger, d->takes_dir, d->resume_token != 0, why);
     if (err == -EBUSY) {
         d->resuming = false; // a take came between: later
         return;
@@ -705,6 +743,7 @@ static void find_unfinished(struct daemon *d)
         struct ledger l;
         take_dir(d, entries[i]->d_name, path, sizeof(path));
         if (entries[i]->d_name[0] != '.' && !ledger_read(&l, path)) {
+            know_panorama(d, &l);
             if (l.state != TAKE_VERIFIED && l.state != TAKE_DEVELOPED && l.state != TAKE_SOLVED && l.state != TAKE_FAILED && !strcmp(l.id, entries[i]->d_name))
                 add_unfinished(d, l.id);
             else if (l.processing == LEDGER_OWED && l.state != TAKE_FAILED && !strcmp(l.id, entries[i]->d_name))
@@ -915,6 +954,31 @@ static void ask_capture(struct daemon *d, uint64_t token, const struct json *req
         refuse(d, token, err, why);
     else
         d->take_token = token;
+}
+
+static void ask_panorama(struct daemon *d, uint64_t token, const struct json *request)
+{
+    const char *name = "panorama";
+    char why[200];
+    json_get_string(request, "name", &name);
+    const int err = d->n_unfinished ? -EBUSY : begin_take(d, TAKE_PANORAMA, name, false, why);
+    if (d->n_unfinished)
+        snprintf(why, sizeof(why), "an unfinished take is being collected; wait for it");
+    if (err)
+        refuse(d, token, err, why);
+    else
+        d->take_token = token;
+}
+
+static void ask_continue(struct daemon *d, uint64_t token, const struct json *request)
+{
+    char why[200];
+    (void)request;
+    const int err = rig_continue(d->rig, now_ns(), why);
+    if (err)
+        refuse(d, token, err, why);
+    else
+        control_reply(d->control, token, json_new_object());
 }
 
 static void ask_preflight(struct daemon *d, uint64_t token, const struct json *request)
@@ -1286,7 +1350,7 @@ static void on_request(void *arg, uint64_t token, const char *what, const struct
         const char *what;
         void (*ask)(struct daemon *d, uint64_t token, const struct json *request);
     } requests[] = {
-        { "status", ask_status }, { "capture", ask_capture }, { "preflight", ask_preflight }, { "calibrate", ask_calibrate }, { "identify", ask_identify },
+        { "status", ask_status }, { "capture", ask_capture }, { "panorama", ask_panorama }, { "continue", ask_continue }, { "preflight", ask_preflight }, { "calibrate", ask_calibrate }, { "identify", ask_identify },
         { "reinstate", ask_reinstate }, { "cancel", ask_cancel }, { "takes", ask_takes }, { "report", ask_report }, { "resume", ask_resume }, { "export", ask_export },
         { "doctor", ask_doctor }, { "metrics", ask_metrics }, { "process", ask_process }, { "preview", ask_preview },
     };
@@ -1296,7 +1360,7 @@ static void on_request(void *arg, uint64_t token, const char *what, const struct
             return;
         }
     struct daemon *d = arg;
-    control_refuse(d->control, token, "unknown", "expected status, capture, preflight, calibrate, identify, reinstate, cancel, takes, report, resume, process, preview, export, doctor, metrics or subscribe");
+    control_refuse(d->control, token, "unknown", "expected status, capture, panorama, continue, preflight, calibrate, identify, reinstate, cancel, takes, report, resume, process, preview, export, doctor, metrics or subscribe");
 }
 
 static int on_control(sd_event_source *source, int fd, uint32_t events, void *arg)
@@ -1366,6 +1430,11 @@ static void obey(struct daemon *d, const struct rig_action *a)
     case RIG_MANIFEST:
         j = new_job(work_manifest, done_manifest);
         know_copies(j, l);
+        if (l->kind == TAKE_PANORAMA) {
+            struct json *plan = describe_plan(l, &d->config);
+            j->text = json_text(plan);
+            json_free(plan);
+        }
         j->value = utc_ms() / 1000;
         take_dir(d, l->id, j->dir, sizeof(j->dir));
         give(d, j);
@@ -1395,6 +1464,25 @@ static void obey(struct daemon *d, const struct rig_action *a)
         else
             control_reply(d->control, d->identify_token[a->camera], json_new_object());
         d->identify_token[a->camera] = 0;
+        return;
+    case RIG_HEAD: {
+        const int err = d->trigger ? trigger_head(d->trigger, a->head.yaw_mdeg, a->head.pitch_mdeg) : -ENODEV;
+        if (err)
+            rig_head_arrived(d->rig, now_ns(), err);
+        return;
+    }
+    case RIG_PROMPT: {
+        struct json *o = json_new_object();
+        json_set_string(o, "take", l->id);
+        json_set_bool(o, "on", a->on);
+        json_set_string(o, "text", a->text);
+        control_publish(d->control, "prompt", o);
+        if (a->on)
+            log_info("rig: %s", a->text);
+        return;
+    }
+    case RIG_PROGRESS:
+        control_publish(d->control, "panorama", describe_progress(l, &a->progress));
         return;
     }
 }

@@ -237,7 +237,7 @@ static void read_exposure(struct raw_frame *f, const libraw_data_t *raw, const c
     f->has_subseconds = exif.has_subseconds;
     f->taken_ns = exif.taken_ns;
     struct tm tm;
-    if (!f->has_time && raw->other.timestamp > 0 && localtime_r(&raw->other.timestamp, &tm)) { // mktime's, of this host's zone
+    if (!f->has_time && raw->other.timestamp > 0 && raw->other.timestamp < 7000000000 && localtime_r(&raw->other.timestamp, &tm)) { // mktime's, of this host's zone
         f->has_time = true;
         f->taken_ns = (int64_t)timegm(&tm) * 1000000000;
     }
@@ -297,4 +297,108 @@ void raw_free(struct raw_frame *f)
         free(f->site);
         *f = (struct raw_frame){ 0 };
     }
+}
+
+int raw_read_head(struct raw_frame *out, const char *path, char *why, size_t room)
+{
+    struct decoder d;
+    *out = (struct raw_frame){ 0 };
+    const int err = decoder_open(&d, path, why, room);
+    if (!err) {
+        out->width = d.raw->sizes.width;
+        out->height = d.raw->sizes.height;
+        read_colour(out, d.raw);
+        read_exposure(out, d.raw, path);
+    }
+    decoder_close(&d);
+    return err;
+}
+
+const char *raw_library(void)
+{
+    return libraw_version();
+}
+
+// ---- interpolated ------------------------------------------------------------------------------------------------------------
+
+// What dcraw is told by -4 -o 0 -r 1 1 1 1 -t 0. adjust_maximum_thr: LibRaw's own idea, which lowers the white level to the picture's.
+static void as_dcraw(libraw_output_params_t *p, enum raw_quality quality)
+{
+    p->output_bps = 16;
+    p->gamm[0] = p->gamm[1] = 1;
+    p->no_auto_bright = 1;
+    p->adjust_maximum_thr = 0;
+    p->use_camera_wb = p->use_auto_wb = 0;
+    for (int i = 0; i < 4; i++)
+        p->user_mul[i] = 1;
+    p->output_color = 0;
+    p->user_flip = 0;
+    p->user_qual = quality;
+}
+
+int raw_interpolate(struct raw_rgb *out, const char *path, enum raw_quality quality, const struct raw_frame *like, char *why, size_t room)
+{
+    enum { PEDESTAL_DN = 64 };
+    struct decoder *d = calloc(1, sizeof(*d));
+    double black[3] = { 0 }, pedestal = PEDESTAL_DN;
+    *out = (struct raw_rgb){ 0 };
+    if (!d) {
+        snprintf(why, room, "out of memory");
+        return -ENOMEM;
+    }
+    int err = decoder_open(d, path, why, room);
+    if (!err)
+        err = outcome(d, libraw_unpack(d->raw), why, room);
+    if (!err)
+        err = require_bayer(d->raw, why, room);
+    if (err)
+        goto fail;
+    libraw_output_params_t *p = &d->raw->params;
+    as_dcraw(p, quality);
+    for (int i = 0; i < 4 && like; i++)
+        pedestal = fmin(pedestal, like->black[i / 2][i % 2]);
+    for (int i = 0; i < 4 && like; i++) {
+        const int y = i / 2, x = i % 2, filter = like->cfa[y][x];
+        p->user_cblack[libraw_COLOR(d->raw, y, x)] = (int)(like->black[y][x] - pedestal);
+        black[filter] += like->black[y][x] / (filter == RAW_GREEN ? 2 : 1);
+        p->user_mul[libraw_COLOR(d->raw, y, x)] = (float)like->daylight[filter];
+    }
+    if (like) {
+        p->user_black = 0;
+        p->highlight = 1; // the largest multiplier becomes 1: nothing is cut off
+    }
+    err = outcome(d, libraw_dcraw_process(d->raw), why, room);
+    if (err)
+        goto fail;
+    out->width = d->raw->sizes.iwidth;
+    out->height = d->raw->sizes.iheight;
+    out->pixel = (const uint16_t(*)[4])d->raw->image;
+    out->decoder = d;
+    if (!d->raw->image || (like && (out->width != like->width || out->height != like->height))) {
+        snprintf(why, room, "LibRaw gave %d x %d pixels", out->width, out->height);
+        err = -EBADMSG;
+        goto fail;
+    }
+    for (int c = 0; c < 3 && like; c++) { // what LibRaw multiplied by
+        const double most = fmax(like->daylight[0], fmax(like->daylight[1], like->daylight[2]));
+        const double scale = like->daylight[c] / most * 65535 / d->raw->color.maximum, range = like->white - black[c];
+        out->unit[c] = 1 / (scale * range);
+        out->pedestal[c] = pedestal / range;
+    }
+    return 0;
+fail:
+    decoder_close(d);
+    free(d);
+    *out = (struct raw_rgb){ 0 };
+    return err;
+}
+
+void raw_rgb_free(struct raw_rgb *r)
+{
+    if (r && r->decoder) {
+        decoder_close(r->decoder);
+        free(r->decoder);
+    }
+    if (r)
+        *r = (struct raw_rgb){ 0 };
 }

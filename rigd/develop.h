@@ -44,3 +44,20 @@ struct raw_frame {
 
 int raw_read(struct raw_frame *out, const char *path, char *why, size_t room);
 void raw_free(struct raw_frame *f); // NULL and zeroed allowed; leaves it zeroed
+
+// Without site: the head of the file alone, for what is decided before anything large is read. Levels may be those before decoding.
+int raw_read_head(struct raw_frame *out, const char *path, char *why, size_t room);
+const char *raw_library(void); // LibRaw's version
+
+// The whole frame interpolated by LibRaw to 16-bit RGB, as it lies on the sensor: 10 bytes per pixel while it is open.
+enum raw_quality { RAW_BILINEAR = 0, RAW_AHD = 3 }; // dcraw's -q
+struct raw_rgb {
+    int width, height;
+    const uint16_t (*pixel)[4];  // [height][width]; the fourth is not ours
+    double unit[3], pedestal[3]; // (DN - black) / (white - black) = unit[c] x pixel[c] - pedestal[c]
+    void *decoder;
+};
+// like NULL: exactly what `dcraw -4 -o 0 -r 1 1 1 1 -t 0 -q <quality>` gives. Else a raw_read() of the same file: balanced by its
+// daylight, so that AHD compares like with like, without clipping at the common white, and with noise below black kept.
+int raw_interpolate(struct raw_rgb *out, const char *path, enum raw_quality quality, const struct raw_frame *like, char *why, size_t room);
+void raw_rgb_free(struct raw_rgb *r); // NULL and zeroed allowed; leaves it zeroed

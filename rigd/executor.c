@@ -93,8 +93,8 @@ __attribute__((noreturn)) static void become(const struct executor_command *c, c
     prctl(PR_SET_PDEATHSIG, SIGKILL);
     if (getppid() != keeper)
         _exit(127);
-    if (setpriority(PRIO_PROCESS, 0, NICENESS))
-        errno = 0; // a wish
+    if (getpriority(PRIO_PROCESS, 0) < NICENESS)
+        setpriority(PRIO_PROCESS, 0, NICENESS);
     write_file("/proc/self/oom_score_adj", "500", 3);
     const int null = open("/dev/null", O_RDONLY);
     if (null != 0)

@@ -75,7 +75,7 @@ static bool seconds_of(const char *text, int64_t *seconds)
 {
     struct tm tm = { 0 };
     if (sscanf(text, "%4d:%2d:%2d %2d:%2d:%2d", &tm.tm_year, &tm.tm_mon, &tm.tm_mday, &tm.tm_hour, &tm.tm_min, &tm.tm_sec) != 6 ||
-        tm.tm_year < 1970 || tm.tm_mon < 1 || tm.tm_mon > 12 || tm.tm_mday < 1 || tm.tm_mday > 31 || tm.tm_hour < 0 || tm.tm_hour > 23 ||
+        tm.tm_year < 1970 || tm.tm_year > 2200 || tm.tm_mon < 1 || tm.tm_mon > 12 || tm.tm_mday < 1 || tm.tm_mday > 31 || tm.tm_hour < 0 || tm.tm_hour > 23 ||
         tm.tm_min < 0 || tm.tm_min > 59 || tm.tm_sec < 0 || tm.tm_sec > 60)
         return false;
     tm.tm_year -= 1900;
@@ -164,7 +164,7 @@ static bool read_directory(struct exif *out, const struct tiff *t, int64_t at, i
 // A TIFF's four bytes: "II*\0", "MM\0*", and the other numbers that Olympus and Panasonic write there.
 static bool is_tiff(const uint8_t *p)
 {
-    return (p[0] == 'I' && p[1] == 'I' && (p[2] == 42 || p[2] == 'U' || p[2] == 'R')) || (p[0] == 'M' && p[1] == 'M' && (p[3] == 42 || p[3] == 'O'));
+    return (p[0] == 'I' && p[1] == 'I' && (p[2] == 42 || p[2] == 'U' || p[2] == 'R')) || (p[0] == 'M' && p[1] == 'M' && (p[3] == 42 || p[2] == 'O'));
 }
 
 static bool read_tiff(struct exif *out, struct tiff t, int64_t *subsec_ns)
@@ -216,8 +216,8 @@ int exif_read(struct exif *out, int fd)
 double exif_true_time_s(double label_s, double apex_s)
 {
     // Rounding of labels reaches .093 stops (1/15, 1/30, 1/60, 15, 30); a third and a half lie .167 apart.
-    const double most_off = .1, apex_off = .02;
-    if (!(label_s > 0) || !isfinite(label_s))
+    const double most_off = .1, apex_off = .02, dial_end_s = 30.5;
+    if (!(label_s > 0) || label_s > dial_end_s)
         return label_s;
     const double stops = log2(label_s), third = round(3 * stops) / 3, half = round(2 * stops) / 2;
     if (apex_s > 0) {

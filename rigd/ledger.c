@@ -198,6 +198,8 @@ static struct json *exposure_json(const struct ledger_exposure *e)
     json_set_number(v, "pitch_deg", e->pitch_deg);
     json_set_number(v, "wanted_s", e->wanted_s);
     json_set_string(v, "label", e->label);
+    if (e->rejected)
+        json_set_bool(v, "rejected", true);
     if (e->object >= 0) {
         json_set_int(v, "object", e->object);
         json_set(v, "facts", frame_facts_json(&e->facts));
@@ -485,6 +487,7 @@ static void get_exposure(struct reader *r, struct ledger_camera *c)
     get_string(&v, "label", e->label, sizeof(e->label));
     if (!(e->wanted_s > 0 && e->wanted_s < 3600))
         complain(&v, "wanted_s", "an exposure time");
+    e->rejected = json_get(v.v, "rejected") && get_bool(&v, "rejected");
     e->object = (int)get_int(&v, "object", 0, LEDGER_OBJECTS_MAX - 1, -1);
     if (e->object >= 0 && frame_facts_from_json(&e->facts, json_get(v.v, "facts")))
         complain(&v, "facts", "a frame's exposure and light");

@@ -59,6 +59,7 @@ struct ledger_exposure {
     double wanted_s;        // true time, a power of two in thirds of a stop
     char label[16];         // of it, on the dial
     int object;             // whose facts these are; -1: none yet
+    bool rejected;          // not the frame that was wanted, note says why
     struct frame_facts facts;
 };
 

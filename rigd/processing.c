@@ -443,6 +443,16 @@ static void start(struct processing *p, int64_t now_ns, const struct candidate *
     act(p, PROCESSING_STATE, c->take, c->step, 0);
 }
 
+// Something that has no time is between two steps, with the disk: what has time does not begin just to make room again.
+static bool better_is_coming(const struct processing *p)
+{
+    for (int t = 0; t < p->n_takes; t++)
+        for (int s = 0; s <= STEP_PREVIEW; s++)
+            if (p->take[t]->step[s].state == PROCESSING_LOOKING || count(&p->take[t]->step[s], ITEM_ENDED) || count(&p->take[t]->step[s], ITEM_KEEPING))
+                return true;
+    return false;
+}
+
 static void schedule(struct processing *p, int64_t now_ns)
 {
     struct candidate c, victim;
@@ -450,6 +460,8 @@ static void schedule(struct processing *p, int64_t now_ns)
     while (best(p, &c, develop_is_full)) {
         const struct load l = measure(p);
         const struct item *i = item_of(&c);
+        if (c.step > STEP_PREVIEW && better_is_coming(p))
+            return;
         if (c.step == STEP_DEVELOP && !i->paused && l.develops > 0 &&
             (l.develops >= p->settings.n_develop || l.memory_bytes + i->what.memory_bytes > p->settings.memory_bytes)) {
             develop_is_full = true; // others may use the cores
@@ -886,10 +898,14 @@ void processing_record(const struct processing *p, const char *take, struct proc
     const bool developed = t->step[t->is_panorama ? STEP_PANORAMA : STEP_DEVELOP].state == PROCESSING_DONE;
     const bool solved = t->step[STEP_PREVIEW].state == PROCESSING_DONE || t->step[STEP_STANDARD].state == PROCESSING_DONE || t->step[STEP_FINAL].state == PROCESSING_DONE;
     out->state = solved ? TAKE_SOLVED : developed ? TAKE_DEVELOPED : TAKE_VERIFIED;
-    out->processing = !all_settled(t, ~0u) ? LEDGER_OWED : t->cancelled ? LEDGER_CANCELLED : LEDGER_SETTLED;
+    out->processing = all_settled(t, ~0u) ? LEDGER_SETTLED : LEDGER_OWED;
     for (int s = 0; s < PROCESSING_N_STEPS; s++) {
         const struct step *step = &t->step[s];
+        if (step->state == PROCESSING_CANCELLED && out->processing == LEDGER_SETTLED)
+            out->processing = LEDGER_CANCELLED;
         char text[PROCESSING_TEXT];
+        if (s == STEP_SHEET && step->state == PROCESSING_DONE && t->step[STEP_FOCUS].state == PROCESSING_DONE)
+            continue; // the developed frames know better
         for (int i = 0; i < step->n_items; i++)
             if (step->item[i].text[0] && (step->item[i].state == ITEM_FAILED || step->item[i].state == ITEM_DONE)) {
                 describe_item(text, sizeof(text), &step->item[i]);

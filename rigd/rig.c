@@ -100,7 +100,7 @@ void rig_set_state(struct rig *r, enum take_state state)
 
 struct ledger_camera *rig_entry(struct rig *r, int i)
 {
-    return &r->ledger.camera[i];
+    return &r->ledger.camera[r->purpose == FOR_PANORAMA ? r->panorama.entry : i];
 }
 // Move on as long as a phase is over; then see to the ledger.
 void rig_settle(struct rig *r, int64_t now)
@@ -126,6 +126,12 @@ void rig_settle(struct rig *r, int64_t now)
                 r->covered = r->change;
                 rig_act(r, RIG_CREATE, CONFIG_NONE);
             }
+            break;
+        case PHASE_TURN:
+        case PHASE_STILL:
+        case PHASE_ADJUST:
+        case PHASE_NOTE:
+            rig_panorama_phase_over(r, now);
             break;
         case PHASE_CREATE:
         case PHASE_FIRE:
@@ -168,6 +174,8 @@ void rig_time(struct rig *r, int64_t now)
             r->free_bytes = -ETIMEDOUT;
         }
     }
+    if (now >= r->phase_due_ns)
+        rig_panorama_time(r, now);
     if (r->phase == PHASE_FIRE && now >= r->phase_due_ns) {
         rig_say(r, RIG_ERROR, CONFIG_NONE, "the trigger did not report the shot; its lines are released");
         rig_act(r, RIG_RELEASE, CONFIG_NONE);
@@ -193,14 +201,14 @@ int64_t rig_deadline_ns(const struct rig *r)
             due = sooner(due, b->flight.due_ns);
         else if (b->retry_ns && (b->supply != WIRED || (b->greeted && !silent)))
             due = sooner(due, b->retry_ns);
-        else if (b->condition == RIG_READY && r->phase == PHASE_IDLE)
+        else if (b->condition == RIG_READY && rig_rests(r))
             due = sooner(due, b->heartbeat_ns);
         if (b->condition == RIG_RECOVERING)
             due = sooner(due, b->trouble_ns + TROUBLE_MS * MS);
         if (b->condition == RIG_QUARANTINED && r->phase == PHASE_IDLE && !b->worker)
             due = sooner(due, b->again_ns);
     }
-    if (r->phase == PHASE_PREFLIGHT || r->phase == PHASE_ARM || r->phase == PHASE_FIRE)
+    if (r->phase == PHASE_PREFLIGHT || r->phase == PHASE_ARM || r->phase == PHASE_FIRE || r->phase == PHASE_TURN || r->phase == PHASE_STILL || r->phase == PHASE_ADJUST)
         due = sooner(due, r->phase_due_ns);
     if (r->phase == PHASE_EXPOSE)
         due = sooner(due, r->quiet_until_ns);
@@ -213,6 +221,8 @@ int64_t rig_deadline_ns(const struct rig *r)
 void rig_trigger_is(struct rig *r, int64_t now, int abilities)
 {
     r->abilities = abilities;
+    if (abilities < 0)
+        rig_head_arrived(r, now, -EIO); // if one was asked to move
     rig_settle(r, now);
 }
 void rig_space(struct rig *r, int64_t now, int64_t free_bytes)
@@ -235,6 +245,8 @@ void rig_committed(struct rig *r, int64_t now, int err)
             r->durable = r->covered;
             if (r->cancelled)
                 rig_fail_take(r, now, "cancelled");
+            else if (r->purpose == FOR_PANORAMA)
+                rig_panorama_next(r, now);
             else
                 rig_begin_fire(r, now);
         }
@@ -267,10 +279,10 @@ void rig_committed(struct rig *r, int64_t now, int err)
 }
 // ---- requests -------------------------------------------------------------------------------------------------------------------------------
 
-static int may_begin(const struct rig *r, bool needs_trigger, char *why)
+int rig_may_begin(const struct rig *r, bool needs_trigger, char *why)
 {
     if (r->phase != PHASE_IDLE) {
-        snprintf(why, 200, "a %s is under way (%s); wait for it", r->purpose == FOR_TAKE || r->purpose == FOR_RESUME ? "take" : "preflight or calibration", take_state_name(rig_state(r)));
+        snprintf(why, 200, "a %s is under way (%s); wait for it", r->purpose == FOR_TAKE || r->purpose == FOR_RESUME ? "take" : r->purpose == FOR_PANORAMA ? "panorama" : "preflight or calibration", take_state_name(rig_state(r)));
         return -EBUSY;
     }
     if (needs_trigger && r->abilities < 0) {
@@ -280,33 +292,41 @@ static int may_begin(const struct rig *r, bool needs_trigger, char *why)
     return 0;
 }
 
-static void new_ledger(struct rig *r)
+// The ledger is the caller's to fill.
+void rig_new_ledger(struct rig *r)
 {
     ledger_free(&r->ledger);
-    ledger_init(&r->ledger, r->config);
-    if (!r->ledger.camera)
-        abort();
     r->has_ledger = true;
     r->created = r->committing = false;
     r->change = r->durable = r->covered = 0;
     r->n_commit_failures = r->n_fire_tries = 0;
     r->commit_retry_ns = 0;
     r->shot_ns = 0;
+    r->outcome[0] = 0;
+    r->cancelled = false;
+}
+
+void rig_name_take(struct rig *r, int64_t now, const struct rig_take *take)
+{
+    snprintf(r->ledger.id, sizeof(r->ledger.id), "%s", take->id);
+    snprintf(r->ledger.name, sizeof(r->ledger.name), "%s", take->name);
+    snprintf(r->ledger.created, sizeof(r->ledger.created), "%s", take->created);
+    snprintf(r->ledger.panorama_take, sizeof(r->ledger.panorama_take), "%s", take->panorama_take ? take->panorama_take : "");
+    snprintf(r->takes_dir, sizeof(r->takes_dir), "%s", take->takes_dir);
+    r->utc_ms = take->utc_ms;
+    r->utc_at_ns = now;
 }
 
 int rig_capture(struct rig *r, int64_t now, const struct rig_take *take, bool without_missing, char *why)
 {
-    const int err = may_begin(r, true, why);
+    const int err = rig_may_begin(r, true, why);
     if (err)
         return err;
-    new_ledger(r);
-    snprintf(r->ledger.id, sizeof(r->ledger.id), "%s", take->id);
-    snprintf(r->ledger.name, sizeof(r->ledger.name), "%s", take->name);
-    snprintf(r->ledger.created, sizeof(r->ledger.created), "%s", take->created);
-    snprintf(r->takes_dir, sizeof(r->takes_dir), "%s", take->takes_dir);
-    r->outcome[0] = 0;
-    r->utc_ms = take->utc_ms;
-    r->utc_at_ns = now;
+    rig_new_ledger(r);
+    ledger_init(&r->ledger, r->config);
+    if (!r->ledger.camera)
+        abort();
+    rig_name_take(r, now, take);
     r->without_missing = without_missing;
     r->purpose = FOR_TAKE;
     rig_set_state(r, TAKE_PREFLIGHT);
@@ -317,7 +337,7 @@ int rig_capture(struct rig *r, int64_t now, const struct rig_take *take, bool wi
 
 int rig_preflight(struct rig *r, int64_t now, char *why)
 {
-    const int err = may_begin(r, false, why);
+    const int err = rig_may_begin(r, false, why);
     if (err)
         return err;
     r->purpose = FOR_PREFLIGHT;
@@ -329,7 +349,7 @@ int rig_preflight(struct rig *r, int64_t now, char *why)
 
 int rig_calibrate(struct rig *r, int64_t now, int n_shots, char *why)
 {
-    const int err = may_begin(r, true, why);
+    const int err = rig_may_begin(r, true, why);
     if (err)
         return err;
     if (!(r->abilities & TRIGGER_FEEDBACK)) {
@@ -416,20 +436,21 @@ fail:
     return false;
 }
 
-int rig_resume(struct rig *r, int64_t now, struct ledger *old, const char *takes_dir, char *why)
+int rig_resume(struct rig *r, int64_t now, struct ledger *old, const char *takes_dir, bool attended, char *why)
 {
-    const int err = may_begin(r, false, why);
+    const int err = rig_may_begin(r, false, why);
     if (err)
         return err;
-    new_ledger(r);
+    r->panorama.attended = attended;
+    if (old->kind == TAKE_PANORAMA)
+        return rig_resume_panorama(r, now, old, takes_dir, why);
+    rig_new_ledger(r);
     if (!adopt(r, old)) {
         snprintf(why, 200, "out of memory");
         return -ENOMEM;
     }
     snprintf(r->takes_dir, sizeof(r->takes_dir), "%s", takes_dir);
     r->purpose = FOR_RESUME;
-    r->outcome[0] = 0;
-    r->cancelled = false;
     r->created = true;
     r->phase = PHASE_COLLECT;
     r->n_findings = 0;
@@ -508,6 +529,8 @@ int rig_cancel(struct rig *r, int64_t now, char *why)
     r->cancelled = true;
     if (r->phase == PHASE_PREFLIGHT || r->phase == PHASE_ARM)
         rig_fail_take(r, now, "cancelled");
+    else if (r->phase == PHASE_TURN || r->phase == PHASE_STILL || r->phase == PHASE_ADJUST || r->phase == PHASE_NOTE)
+        rig_fail_take(r, now, "cancelled");
     else if (r->phase == PHASE_FIRE)
         rig_act(r, RIG_RELEASE, CONFIG_NONE);
     rig_settle(r, now);
@@ -530,6 +553,18 @@ void rig_start(struct rig *r, int64_t now)
 
 // ---- life and views -------------------------------------------------------------------------------------------------------------------------
 
+static bool judge_through(struct rig *r, const struct lens *lens)
+{
+    struct json *o = lens_json(lens);
+    char *text = json_text(o);
+    const bool fits = text && strlen(text) < sizeof(r->panorama.judge);
+    if (fits)
+        strcpy(r->panorama.judge, text);
+    free(text);
+    json_free(o);
+    return fits;
+}
+
 int rig_create(struct rig **out, const struct config *config)
 {
     struct rig *r = calloc(1, sizeof(*r));
@@ -542,6 +577,10 @@ int rig_create(struct rig **out, const struct config *config)
     r->delay_us = calloc((size_t)r->n + 1, sizeof(*r->delay_us));
     r->finding = calloc(FINDINGS_MAX, sizeof(*r->finding));
     if (!r->body || !r->delay_us || !r->finding) {
+        rig_free(r);
+        return -ENOMEM;
+    }
+    if (config_panorama_camera(config) != CONFIG_NONE && !judge_through(r, &config->panorama.lens)) {
         rig_free(r);
         return -ENOMEM;
     }
@@ -597,7 +636,7 @@ enum take_state rig_state(const struct rig *r)
 {
     if (r->phase == PHASE_IDLE)
         return TAKE_IDLE;
-    if (r->purpose == FOR_TAKE || r->purpose == FOR_RESUME)
+    if (r->purpose == FOR_TAKE || r->purpose == FOR_RESUME || r->purpose == FOR_PANORAMA)
         return r->ledger.state;
     return r->phase == PHASE_PREFLIGHT ? TAKE_PREFLIGHT : r->phase == PHASE_COLLECT ? TAKE_COLLECTING : r->phase == PHASE_ARM ? TAKE_ARMED : TAKE_EXPOSING;
 }

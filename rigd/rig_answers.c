@@ -1,6 +1,7 @@
 // rigd/rig_answers.c - what a camera's worker answered, and what follows from it.
 #include "rigd/rig_inside.h"
 
+#include <errno.h>
 #include <math.h>
 #include <stdio.h>
 #include <string.h>
@@ -64,7 +65,7 @@ static void listed(struct rig *r, int i, int64_t now, const struct camera_event 
 static void done(struct rig *r, int i, int64_t now, const struct camera_event *e, int k)
 {
     struct body *b = &r->body[i];
-    const bool keeps_frames = r->purpose == FOR_TAKE || r->purpose == FOR_RESUME;
+    const bool keeps_frames = r->purpose == FOR_TAKE || r->purpose == FOR_RESUME || rig_makes_panoramas(r, i);
     struct ledger_camera *c = r->has_ledger && keeps_frames ? rig_entry(r, i) : NULL;
     b->busy_since_ns = 0;
     switch (e->command) {
@@ -83,6 +84,10 @@ static void done(struct rig *r, int i, int64_t now, const struct camera_event *e
         memcpy(b->setting, e->setting, sizeof(b->setting));
         if (b->step != STEP_CONFIGURE)
             break;
+        if (r->phase == PHASE_ADJUST) {
+            rig_panorama_configured(r, i);
+            break;
+        }
         for (int s = 0; s < e->n_settings; s++)
             if (!e->setting[s].equal) {
                 char why[200];
@@ -101,7 +106,7 @@ static void done(struct rig *r, int i, int64_t now, const struct camera_event *e
         break;
     case CAMERA_DRAIN:
         if (b->step == STEP_DRAIN)
-            rig_set_step(r, i, r->purpose == FOR_LAG ? STEP_NONE : STEP_BEFORE);
+            rig_set_step(r, i, r->purpose == FOR_LAG || (r->phase == PHASE_ADJUST && !r->panorama.list_before) ? STEP_NONE : STEP_BEFORE);
         break;
     case CAMERA_LIST:
         if (b->step == STEP_BEFORE && c) {
@@ -114,6 +119,7 @@ static void done(struct rig *r, int i, int64_t now, const struct camera_event *e
             c->battery_percent = b->status.battery_percent;
             c->n_settings = b->n_settings;
             memcpy(c->setting, b->setting, sizeof(c->setting));
+            c->has_until = r->panorama.list_before = false;
             rig_set_step(r, i, STEP_NONE);
         } else if (b->step == STEP_RECONCILE && c) {
             listed(r, i, now, e);
@@ -122,6 +128,8 @@ static void done(struct rig *r, int i, int64_t now, const struct camera_event *e
     case CAMERA_TRIGGER:
         if (e->pressed_ns && b->flash_ns == INT64_MIN)
             b->flash_ns = e->pressed_ns; // the best that is known without wires
+        if (rig_makes_panoramas(r, i) && rig_pressed_by_driver(r))
+            rig_fired(r, now, 0, e->pressed_ns, 0);
         break;
     case CAMERA_COLLECT:
         if (b->step != STEP_COLLECT)
@@ -146,6 +154,8 @@ static void done(struct rig *r, int i, int64_t now, const struct camera_event *e
         memcpy(c->object[k].xxh128, e->xxh128, sizeof(c->object[k].xxh128));
         c->object[k].copied_ms = r->shot_ns ? (now - r->shot_ns) / MS : -1;
         rig_changed(r);
+        if (r->purpose == FOR_PANORAMA)
+            rig_panorama_frame(r, k, e);
         b->n_failed = 0;
         rig_look_at_debt(r, i, now);
         break;
@@ -203,6 +213,8 @@ static void failed_softly(struct rig *r, int i, int64_t now, const struct camera
         return;
     case CAMERA_TRIGGER: // it may have fired all the same: the card will tell
         rig_say(r, RIG_WARNING, i, "%s", why);
+        if (rig_makes_panoramas(r, i) && rig_pressed_by_driver(r))
+            rig_fired(r, now, -EIO, now, -1);
         return;
     case CAMERA_OPEN:
         rig_trouble(r, i, now, b->flight.since_ns, CAMERA_OPEN, why);
@@ -250,7 +262,7 @@ void rig_camera_event(struct rig *r, int64_t now, int i, const struct camera_eve
     } else if (!b->flight.on || e->seq != b->seq) {
         return; // of a command that nobody waits for any more
     } else if (e->kind == CAMERA_OBJECT) {
-        if (r->phase == PHASE_COLLECT && r->purpose != FOR_LAG && rig_entry(r, i)->expected && b->flight.kind == CAMERA_COLLECT)
+        if (r->phase == PHASE_COLLECT && r->purpose != FOR_LAG && (r->purpose != FOR_PANORAMA || rig_makes_panoramas(r, i)) && rig_entry(r, i)->expected && b->flight.kind == CAMERA_COLLECT)
             note_object(r, i, &e->object[0]);
     } else if (e->kind == CAMERA_PROGRESS) {
         if (e->size_bytes > b->bytes_now) { // only bytes count

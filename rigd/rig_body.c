@@ -58,7 +58,9 @@ void rig_give_up(struct rig *r, int i, const char *why)
         return;
     const enum step step = b->step;
     rig_set_step(r, i, STEP_NONE);
-    if (r->phase == PHASE_PREFLIGHT || r->phase == PHASE_ARM) {
+    if (r->phase == PHASE_ADJUST) {
+        snprintf(r->panorama.lost, sizeof(r->panorama.lost), "%.199s", why);
+    } else if (r->phase == PHASE_PREFLIGHT || r->phase == PHASE_ARM) {
         b->part = false;
         rig_find(r, RIG_ERROR, i, "%s", why);
         if (r->purpose == FOR_TAKE) {
@@ -70,7 +72,8 @@ void rig_give_up(struct rig *r, int i, const char *why)
         c->debt = DEBT_MISSED;
         snprintf(c->note, sizeof(c->note), "%.199s", why);
         rig_changed(r);
-        rig_say(r, RIG_ERROR, i, "its frame was not fetched: %s", why);
+        if (r->purpose != FOR_PANORAMA || !r->panorama.looking)
+            rig_say(r, r->purpose == FOR_PANORAMA ? RIG_WARNING : RIG_ERROR, i, "its frame was not fetched: %s", why);
     } else if (r->phase == PHASE_DELETE && step == STEP_DELETE) {
         rig_say(r, RIG_WARNING, i, "frames stay on its card, they were not deleted: %s", why);
     }
@@ -81,7 +84,13 @@ void rig_give_up(struct rig *r, int i, const char *why)
 // Between the last answer before half-press and the end of the exposure no camera hears anything.
 bool rig_is_silent(const struct rig *r)
 {
-    return r->phase == PHASE_CREATE || r->phase == PHASE_FIRE || r->phase == PHASE_EXPOSE;
+    return r->phase == PHASE_CREATE || r->phase == PHASE_NOTE || r->phase == PHASE_FIRE || r->phase == PHASE_EXPOSE;
+}
+
+// Nothing is wanted of any camera but a sign of life. (A person may take minutes to turn a head.)
+bool rig_rests(const struct rig *r)
+{
+    return r->phase == PHASE_IDLE || r->phase == PHASE_TURN;
 }
 
 static struct camera_command *send(struct rig *r, int i, int64_t now, enum camera_command_kind kind, uint32_t timeout_ms)
@@ -174,13 +183,28 @@ void rig_copy_next(struct rig *r, int controller, int64_t now)
             take_path(r, c->path, sizeof(c->path), file);
         } else {
             c = send(r, i, now, CAMERA_FETCH, r->config->fetch_timeout_ms);
-            b->flight.due_ns = now + PROGRESS_MS * MS;
+            b->flight.due_ns = now + (r->purpose == FOR_PANORAMA ? 2 : 1) * PROGRESS_MS * MS; // it is judged, too
+            if (r->purpose == FOR_PANORAMA)
+                memcpy(c->judge, r->panorama.judge, sizeof(c->judge));
             take_path(r, c->path, sizeof(c->path), o->file);
         }
         c->object = o->object;
         b->flight.object = k;
         r->copying[controller]++;
     }
+}
+
+// The exposure that is wanted in place of the configuration's.
+static void set_shutter(struct camera_command *c, const char *label)
+{
+    int k = 0;
+    while (k < c->n_settings && strcmp(c->setting[k].name, "shutter"))
+        k++;
+    if (k == CAMERA_SETTINGS_MAX)
+        return; // config.c leaves room
+    c->n_settings += k == c->n_settings;
+    snprintf(c->setting[k].name, sizeof(c->setting[k].name), "shutter");
+    snprintf(c->setting[k].value, sizeof(c->setting[k].value), "%s", label);
 }
 
 static void reconcile_next(struct rig *r, int i, int64_t now)
@@ -234,9 +258,23 @@ void rig_look_at_debt(struct rig *r, int i, int64_t now)
     rig_set_step(r, i, STEP_NONE);
 }
 
+static bool has_copies(const struct ledger_camera *c)
+{
+    for (int k = 0; k < c->n_objects; k++)
+        if (c->object[k].state == OBJECT_COPIED)
+            return true;
+    return false;
+}
+
 int rig_to_delete(struct rig *r, int i)
 {
+    if (r->purpose == FOR_PANORAMA) // the first entry with something to delete becomes the present one
+        for (r->panorama.entry = 0; r->panorama.entry < r->ledger.n_cameras - 1; r->panorama.entry++)
+            if (has_copies(rig_entry(r, i)))
+                break;
     const struct ledger_camera *c = rig_entry(r, i);
+    if (!c->expected)
+        return -1;
     for (int k = 0; k < c->n_objects; k++)
         if (c->object[k].state == OBJECT_COPIED)
             return k;
@@ -273,18 +311,20 @@ void rig_pump(struct rig *r, int i, int64_t now)
         c = send(r, i, now, CAMERA_CONFIGURE, 8000);
         c->n_settings = b->config->n_settings;
         memcpy(c->setting, b->config->setting, sizeof(c->setting));
+        if (rig_makes_panoramas(r, i))
+            set_shutter(c, rig_entry(r, i)->exposure.label);
         return;
     case STEP_STATUS:
         send(r, i, now, CAMERA_STATUS, 4000);
         return;
     case STEP_DRAIN:
-        send(r, i, now, CAMERA_DRAIN, 5000)->quiet_ms = DRAIN_QUIET_MS;
+        send(r, i, now, CAMERA_DRAIN, 5000)->quiet_ms = r->phase == PHASE_ADJUST ? ADJUST_QUIET_MS : DRAIN_QUIET_MS;
         return;
     case STEP_BEFORE:
         send(r, i, now, CAMERA_LIST, 6000);
         return;
     case STEP_COLLECT:
-        send(r, i, now, CAMERA_COLLECT, r->config->collect_timeout_ms)->n_objects = r->config->objects_per_shot;
+        send(r, i, now, CAMERA_COLLECT, r->config->collect_timeout_ms)->n_objects = r->purpose == FOR_PANORAMA ? 1 : r->config->objects_per_shot;
         return;
     case STEP_RECONCILE:
         reconcile_next(r, i, now);
@@ -307,7 +347,7 @@ void rig_pump(struct rig *r, int i, int64_t now)
         return;
     }
     case STEP_NONE:
-        if (r->phase == PHASE_IDLE && now >= b->heartbeat_ns) {
+        if (rig_rests(r) && now >= b->heartbeat_ns) {
             send(r, i, now, CAMERA_STATUS, 4000);
             b->heartbeat_ns = now + r->config->heartbeat_s * S;
         }
@@ -462,7 +502,7 @@ void rig_trouble(struct rig *r, int i, int64_t now, int64_t since, enum camera_c
 void rig_works_again(struct rig *r, int i, int64_t now, enum camera_command_kind kind)
 {
     struct body *b = &r->body[i];
-    if (!b->trouble_ns || (kind != b->suspect && !(kind == CAMERA_STATUS && r->phase == PHASE_IDLE)))
+    if (!b->trouble_ns || (kind != b->suspect && !(kind == CAMERA_STATUS && rig_rests(r))))
         return;
     rig_say(r, RIG_INFO, i, "works again after %.1f s", 1e-9 * (double)(now - b->trouble_ns));
     b->trouble_ns = 0;
@@ -504,7 +544,7 @@ void rig_body_time(struct rig *r, int i, int64_t now)
     }
     if (b->flight.on || !b->greeted || now < b->retry_ns)
         return;
-    if (b->retry_ns || (b->condition == RIG_READY && r->phase == PHASE_IDLE && now >= b->heartbeat_ns)) {
+    if (b->retry_ns || (b->condition == RIG_READY && rig_rests(r) && now >= b->heartbeat_ns)) {
         b->retry_ns = 0; // whatever comes of it: a time in the past must not wake us again
         rig_pump(r, i, now);
     }

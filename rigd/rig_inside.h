@@ -1,4 +1,4 @@
-// rigd/rig_inside.h - the rig's inside, shared by rig.c, rig_body.c, rig_answers.c and rig_take.c only.
+// rigd/rig_inside.h - the rig's inside, shared by rig.c, rig_body.c, rig_answers.c, rig_take.c and rig_panorama.c only.
 #pragma once
 #include "rigd/rig.h"
 
@@ -17,8 +17,11 @@ enum {
     REOPEN_MS = 1000,         // between tries when the ladder has no rung left
     QUARANTINE_MS = 60000,    // between tries from quarantine
     DRAIN_QUIET_MS = 200,
+    ADJUST_QUIET_MS = 50,     // between exposures of a panorama: this camera was drained, and has only been listened to since
     PROGRESS_MS = 6000,       // a copy without a byte for so long is stalled
     TRIES_MAX = 3, DISK_TRIES_MAX = 10, COMMIT_TRIES_MAX = 30, FIRE_TRIES_MAX = 3,
+    AWAKE_HALF_PRESS_MS = 150, DRIVER_PRESS_MS = 8000, // of the panorama camera
+    TURN_MS = 60000, TURN_TRIES_MAX = 3, // a head takes so long at most
     FIRE_LEAD_MS = 30,        // from the decision to half-press
     AFTER_EXPOSURE_MS = 100,
     UNMEASURED_LAG_MS = 350,  // from full-press to the open shutter, of a body whose lag is not known; one that slept takes so long
@@ -30,8 +33,9 @@ enum {
     CONTROLLERS_MAX = 256,
 };
 
-enum phase { PHASE_IDLE, PHASE_PREFLIGHT, PHASE_ARM, PHASE_CREATE, PHASE_FIRE, PHASE_EXPOSE, PHASE_COLLECT, PHASE_MANIFEST, PHASE_SETTLE, PHASE_DELETE, PHASE_END };
-enum purpose { FOR_PREFLIGHT, FOR_TAKE, FOR_LAG, FOR_RESUME };
+// TURN to NOTE: of a panorama, before each exposure (rig_panorama.c).
+enum phase { PHASE_IDLE, PHASE_PREFLIGHT, PHASE_ARM, PHASE_CREATE, PHASE_TURN, PHASE_STILL, PHASE_ADJUST, PHASE_NOTE, PHASE_FIRE, PHASE_EXPOSE, PHASE_COLLECT, PHASE_MANIFEST, PHASE_SETTLE, PHASE_DELETE, PHASE_END };
+enum purpose { FOR_PREFLIGHT, FOR_TAKE, FOR_LAG, FOR_RESUME, FOR_PANORAMA };
 enum step { STEP_NONE, STEP_CONFIGURE, STEP_STATUS, STEP_DRAIN, STEP_BEFORE, STEP_COLLECT, STEP_RECONCILE, STEP_COPY, STEP_DELETE };
 
 struct body {
@@ -86,7 +90,7 @@ struct rig {
     enum phase phase;
     enum purpose purpose;
     int64_t phase_due_ns;
-    int n_pending;
+    int n_pending, n_wanted; // bodies with a step | that the take wants
     bool cancelled, without_missing;
     char outcome[200]; // why the last take, preflight or calibration failed; "" it did not
     bool created; // the take's folder is there
@@ -102,6 +106,24 @@ struct rig {
     bool committing;
     int n_commit_failures;
     int64_t commit_retry_ns;
+
+    struct {
+        int entry;                    // the ledger's exposure under way
+        int n_tries;                  // at it
+        int stop_at, n_turns;         // where the head stands, -1: not known | how often it was asked to go to the present stop
+        int64_t turn_limit_ns;        // TURN: a head that is busy is waited for so long
+        bool turn_again;              // TURN: the head failed, and is asked again when the phase is due
+        int n_old, looked;            // resumed: that many entries of before, up to this one looked for on the card
+        bool looking;                 // COLLECT without an exposure: on the card of an earlier life
+        bool list_before;             // resumed: what is on the card now is none of ours
+        double metered_s, shortest_s, longest_s; // as far as the camera accepts them
+        char prompt[320];             // what a person is asked to do; ""
+        bool attended;                // somebody is there who turns the head
+        bool refused;                 // the shutter setting
+        bool failed;                  // r->outcome says why; the plan is written all the same
+        char lost[200];               // the camera; why
+        char judge[CAMERA_LENS_MAX];
+    } panorama;
 
     int n_fire_tries, n_shots, n_shots_wanted;
     int64_t at_ns, pressed_ns, late_ns, released_ns, quiet_until_ns, shot_ns;
@@ -124,6 +146,9 @@ uint64_t rig_changed(struct rig *r);
 void rig_set_state(struct rig *r, enum take_state state);
 struct ledger_camera *rig_entry(struct rig *r, int i);
 void rig_settle(struct rig *r, int64_t now);
+int rig_may_begin(const struct rig *r, bool needs_trigger, char *why);
+void rig_new_ledger(struct rig *r); // empty: the caller fills it
+void rig_name_take(struct rig *r, int64_t now, const struct rig_take *take);
 
 // rig_body.c
 void rig_set_step(struct rig *r, int i, enum step step);
@@ -131,6 +156,7 @@ const char *rig_remedy(enum camera_trouble trouble);
 void rig_explain(char why[200], const char *found, const char *to_do);
 void rig_give_up(struct rig *r, int i, const char *why);
 bool rig_is_silent(const struct rig *r);
+bool rig_rests(const struct rig *r);
 bool rig_is_copy(enum camera_command_kind kind);
 void rig_flight_ends(struct rig *r, struct body *b);
 void rig_copy_next(struct rig *r, int controller, int64_t now);
@@ -158,5 +184,18 @@ bool rig_too_many_missing(struct rig *r, int64_t now);
 void rig_end_preflight(struct rig *r, int64_t now);
 void rig_begin_fire(struct rig *r, int64_t now);
 void rig_begin_collect(struct rig *r, int64_t now);
+void rig_begin_manifest(struct rig *r);
 void rig_end_collect(struct rig *r, int64_t now);
 void rig_begin_delete(struct rig *r, int64_t now);
+
+// rig_panorama.c
+void rig_panorama_unprompt(struct rig *r);
+bool rig_makes_panoramas(const struct rig *r, int i); // this body, now
+bool rig_pressed_by_driver(const struct rig *r);      // the panorama camera has no shutter line of its own
+void rig_panorama_next(struct rig *r, int64_t now);   // an exposure is settled: what now?
+void rig_panorama_phase_over(struct rig *r, int64_t now); // TURN to NOTE: is it?
+void rig_panorama_time(struct rig *r, int64_t now);
+void rig_panorama_collected(struct rig *r, int64_t now);
+void rig_panorama_configured(struct rig *r, int i);   // CONFIGURE was answered, in ADJUST
+void rig_panorama_frame(struct rig *r, int k, const struct camera_event *e); // a copy is here
+int rig_resume_panorama(struct rig *r, int64_t now, struct ledger *old, const char *takes_dir, char *why);

@@ -11,7 +11,7 @@
 
 void rig_finish(struct rig *r, int64_t now)
 {
-    const bool was_take = r->has_ledger && (r->purpose == FOR_TAKE || r->purpose == FOR_RESUME);
+    const bool was_take = r->has_ledger && (r->purpose == FOR_TAKE || r->purpose == FOR_RESUME || r->purpose == FOR_PANORAMA);
     r->phase = PHASE_IDLE;
     for (int i = 0; i < r->n; i++) {
         r->body[i].part = false;
@@ -29,6 +29,7 @@ __attribute__((format(printf, 3, 4))) void rig_fail_take(struct rig *r, int64_t 
     va_end(args);
     for (int i = 0; i < r->n; i++)
         rig_set_step(r, i, STEP_NONE);
+    rig_panorama_unprompt(r);
     if (r->purpose == FOR_LAG || r->purpose == FOR_PREFLIGHT) {
         rig_say(r, RIG_ERROR, CONFIG_NONE, "%s: %s", r->purpose == FOR_LAG ? "calibration" : "preflight", r->outcome);
         rig_finish(r, now);
@@ -36,6 +37,11 @@ __attribute__((format(printf, 3, 4))) void rig_fail_take(struct rig *r, int64_t 
     }
     rig_say(r, RIG_ERROR, CONFIG_NONE, "take %s: %s", r->ledger.id, r->outcome);
     memcpy(r->ledger.reason, r->outcome, sizeof(r->ledger.reason));
+    if (r->created && r->purpose == FOR_PANORAMA) { // what is here can be used, and is to be handed over like all else
+        r->panorama.failed = true;
+        rig_begin_manifest(r);
+        return;
+    }
     rig_set_state(r, TAKE_FAILED);
     if (r->created)
         r->phase = PHASE_END;
@@ -51,10 +57,14 @@ void rig_begin_preflight(struct rig *r, int64_t now)
     r->cancelled = false;
     r->space_known = false;
     rig_act(r, RIG_SPACE, CONFIG_NONE);
+    r->n_wanted = 0;
     for (int i = 0; i < r->n; i++) {
         struct body *b = &r->body[i];
-        b->part = true;
-        b->thumbed = !r->config->thumbnails;
+        b->part = (i == config_panorama_camera(r->config)) == (r->purpose == FOR_PANORAMA);
+        if (!b->part)
+            continue;
+        r->n_wanted++;
+        b->thumbed = !r->config->thumbnails || r->purpose == FOR_PANORAMA;
         b->owed_due_ns = 0;
         b->flash_ns = INT64_MIN;
         b->saw_nothing = false;
@@ -73,21 +83,22 @@ void rig_check_status(struct rig *r, int i)
     struct body *b = &r->body[i];
     const struct camera_status *s = &b->status;
     const struct config *config = r->config;
+    const int objects_per_shot = r->purpose == FOR_PANORAMA ? 1 : config->objects_per_shot;
     char why[200] = "";
     if (s->battery_percent >= 0 && s->battery_percent < config->battery_min_percent)
         snprintf(why, sizeof(why), "battery at %d %%, at least %d %% wanted; change or charge it", s->battery_percent, config->battery_min_percent);
     else if (s->card_present == 0)
         snprintf(why, sizeof(why), "no card; insert one");
-    else if (s->free_images >= 0 && s->free_images < config->objects_per_shot)
-        snprintf(why, sizeof(why), "card has room for %lld pictures, %d wanted; empty it", (long long)s->free_images, config->objects_per_shot);
-    else if (s->free_bytes >= 0 && s->free_bytes < (int64_t)config->raw_mb * config->objects_per_shot << 20)
-        snprintf(why, sizeof(why), "card has %lld MB free, %d wanted; empty it", (long long)(s->free_bytes >> 20), (int)config->raw_mb * config->objects_per_shot);
+    else if (s->free_images >= 0 && s->free_images < objects_per_shot)
+        snprintf(why, sizeof(why), "card has room for %lld pictures, %d wanted; empty it", (long long)s->free_images, objects_per_shot);
+    else if (s->free_bytes >= 0 && s->free_bytes < (int64_t)config->raw_mb * objects_per_shot << 20)
+        snprintf(why, sizeof(why), "card has %lld MB free, %d wanted; empty it", (long long)(s->free_bytes >> 20), (int)config->raw_mb * objects_per_shot);
     else if (s->manual_focus == 0)
         snprintf(why, sizeof(why), "autofocus is on; set the lens to manual focus");
     else if (s->manual_exposure == 0)
         snprintf(why, sizeof(why), "exposure is automatic; turn the mode dial to M");
-    else if (s->objects_per_shot >= 0 && s->objects_per_shot != config->objects_per_shot)
-        snprintf(why, sizeof(why), "its image format writes %d files per shot, rigd.conf says %d; set the format to RAW", s->objects_per_shot, config->objects_per_shot);
+    else if (s->objects_per_shot >= 0 && s->objects_per_shot != objects_per_shot)
+        snprintf(why, sizeof(why), "its image format writes %d files per shot, rigd.conf says %d; set the format to RAW", s->objects_per_shot, objects_per_shot);
     else if (b->config->lens[0] && s->lens[0] && strcmp(b->config->lens, s->lens))
         snprintf(why, sizeof(why), "lens is '%.50s', '%.50s' wanted; change it or rigd.conf", s->lens, b->config->lens);
     if (!isnan(s->clock_offset_s) && fabs(s->clock_offset_s) > config->clock_max_s)
@@ -127,16 +138,16 @@ bool rig_too_many_missing(struct rig *r, int64_t now)
 {
     int n_out = 0, first = -1;
     for (int i = 0; i < r->n; i++)
-        if (!r->body[i].part) {
+        if (!r->body[i].part && (i == config_panorama_camera(r->config)) == (r->purpose == FOR_PANORAMA)) {
             n_out++;
             first = first < 0 ? i : first;
         }
-    if (n_out == r->n || (n_out > r->config->may_miss && !r->without_missing)) {
+    if (n_out == r->n_wanted || (n_out > r->config->may_miss && !r->without_missing)) {
         const char *text = "";
         for (int f = 0; f < r->n_findings && !text[0]; f++)
             if (r->finding[f].camera == first && r->finding[f].severity == RIG_ERROR)
                 text = r->finding[f].text;
-        rig_fail_take(r, now, "%d of %d cameras not fit, first %s: %.120s", n_out, r->n, r->config->camera[first].name, text);
+        rig_fail_take(r, now, "%d of %d cameras not fit, first %s: %.120s", n_out, r->n_wanted, r->config->camera[first].name, text);
         return true;
     }
     return false;
@@ -146,7 +157,8 @@ void rig_end_preflight(struct rig *r, int64_t now)
 {
     const struct config *config = r->config;
     check_firmware(r);
-    const int64_t needed = ((int64_t)config->raw_mb * config->objects_per_shot * r->n + config->free_space_mb) << 20;
+    const int n_frames = r->purpose == FOR_PANORAMA ? config->panorama.n_stops * config->panorama.frames_max : config->objects_per_shot * r->n_wanted;
+    const int64_t needed = ((int64_t)config->raw_mb * n_frames + config->free_space_mb) << 20;
     const bool no_space = r->purpose != FOR_LAG && r->free_bytes < needed;
     if (r->free_bytes < 0)
         rig_find(r, RIG_ERROR, CONFIG_NONE, "%.120s: cannot tell its free space: %s", config->takes_dir, strerror((int)-r->free_bytes));
@@ -184,11 +196,12 @@ static double shutter_s(const char *text)
 static double longest_shutter_s(const struct rig *r)
 {
     double longest = 0;
+    char label[16];
     for (int i = 0; i < r->n; i++)
         for (int k = 0; r->body[i].part && k < r->body[i].n_settings; k++)
             if (!strcmp(r->body[i].setting[k].name, "shutter"))
                 longest = fmax(longest, shutter_s(r->body[i].setting[k].found));
-    return longest;
+    return longest > 0 ? fmax(longest, ledger_exposure_label(longest, label)) : 0; // what is called 15 s lasts 16
 }
 
 // When the last exposure is over, or cannot last longer: where a flash-sync contact was seen, it says when its shutter opened.
@@ -217,7 +230,8 @@ void rig_begin_fire(struct rig *r, int64_t now)
     const struct trigger_config *t = &r->config->trigger;
     struct lag lag[CONFIG_CAMERAS_MAX];
     bool measured = false;
-    if (r->abilities < 0) {
+    const bool by_driver = r->purpose == FOR_PANORAMA && rig_pressed_by_driver(r);
+    if (r->abilities < 0 && !by_driver) {
         rig_fail_take(r, now, "the trigger is gone; see the journal");
         return;
     }
@@ -231,7 +245,17 @@ void rig_begin_fire(struct rig *r, int64_t now)
             r->skip[i / 64] |= UINT64_C(1) << i % 64;
         r->body[i].flash_ns = INT64_MIN;
     }
-    const uint32_t half_ms = r->abilities & TRIGGER_HALF_PRESS ? t->half_press_ms : 0;
+    if (by_driver) {
+        const int i = r->config->panorama.camera;
+        r->at_ns = now;
+        r->phase_due_ns = now + DRIVER_PRESS_MS * MS;
+        r->body[i].press = true;
+        rig_pump(r, i, now);
+        return;
+    }
+    uint32_t half_ms = r->abilities & TRIGGER_HALF_PRESS ? t->half_press_ms : 0;
+    if (r->purpose == FOR_PANORAMA && half_ms > AWAKE_HALF_PRESS_MS)
+        half_ms = AWAKE_HALF_PRESS_MS; // it was spoken to right now, and stands alone: nothing has to be exact
     if (measured && (r->abilities & TRIGGER_DELAYS) && r->purpose == FOR_TAKE) {
         const uint32_t held_ms = half_ms + t->hold_ms; // half-press waits for the slowest: delays count towards max_hold_ms
         const uint32_t room_us = t->max_hold_ms > held_ms ? 1000 * (t->max_hold_ms - held_ms) : 0;
@@ -252,7 +276,7 @@ void rig_begin_collect(struct rig *r, int64_t now)
     for (int i = 0; i < r->n; i++)
         if (r->body[i].part && r->body[i].condition == RIG_READY)
             rig_set_step(r, i, STEP_COLLECT);
-        else if (r->body[i].part && r->purpose == FOR_TAKE)
+        else if (r->body[i].part && (r->purpose == FOR_TAKE || r->purpose == FOR_PANORAMA))
             rig_collect_from_card(r, i, now);
     if (r->purpose == FOR_TAKE)
         rig_set_state(r, TAKE_COLLECTING);
@@ -285,6 +309,13 @@ static void measure_shot(struct rig *r)
             rig_say(r, RIG_WARNING, i, "its shutter opened more than %d ms from the others'; rigctl calibrate lag", LATE_MS);
 }
 
+void rig_begin_manifest(struct rig *r)
+{
+    r->phase = PHASE_MANIFEST;
+    rig_changed(r);
+    rig_act(r, RIG_MANIFEST, CONFIG_NONE);
+}
+
 static void end_lag_shot(struct rig *r, int64_t now)
 {
     for (int i = 0; i < r->n; i++) {
@@ -312,10 +343,12 @@ void rig_end_collect(struct rig *r, int64_t now)
         end_lag_shot(r, now);
         return;
     }
+    if (r->purpose == FOR_PANORAMA) {
+        rig_panorama_collected(r, now);
+        return;
+    }
     measure_shot(r);
-    r->phase = PHASE_MANIFEST;
-    rig_changed(r);
-    rig_act(r, RIG_MANIFEST, CONFIG_NONE);
+    rig_begin_manifest(r);
 }
 
 static void conclude(struct rig *r, int manifest_err)
@@ -335,6 +368,13 @@ static void conclude(struct rig *r, int manifest_err)
         first = first < 0 ? i : first;
     }
     l->reason[0] = 0;
+    if (r->purpose == FOR_PANORAMA && r->panorama.failed) {
+        memcpy(l->reason, r->outcome, sizeof(l->reason)); // said already
+        rig_set_state(r, TAKE_FAILED);
+        rig_changed(r);
+        r->phase = PHASE_SETTLE;
+        return;
+    }
     if (r->purpose == FOR_RESUME && nothing_anywhere && !n_found)
         snprintf(l->reason, sizeof(l->reason), "the shutters were never pressed: no card holds a new frame");
     else if (n_missed)
@@ -356,7 +396,7 @@ void rig_begin_delete(struct rig *r, int64_t now)
     r->phase = PHASE_DELETE;
     if (r->ledger.state == TAKE_VERIFIED && r->config->delete_after_verify)
         for (int i = 0; i < r->n; i++)
-            if (rig_entry(r, i)->expected && rig_to_delete(r, i) >= 0 && r->body[i].condition == RIG_READY)
+            if ((r->purpose != FOR_PANORAMA || rig_makes_panoramas(r, i)) && rig_to_delete(r, i) >= 0 && r->body[i].condition == RIG_READY)
                 rig_set_step(r, i, STEP_DELETE);
     rig_pump_all(r, now);
 }
@@ -398,6 +438,10 @@ void rig_fired(struct rig *r, int64_t now, int err, int64_t pressed_ns, int64_t 
         r->released_ns = now;
         r->quiet_until_ns = quiet_until_ns(r);
         r->phase = PHASE_EXPOSE;
+        if (r->purpose == FOR_PANORAMA && !r->ledger.shot_utc_ms)
+            r->ledger.shot_utc_ms = r->utc_ms + (r->pressed_ns - r->utc_at_ns) / MS;
+        if (r->purpose == FOR_PANORAMA)
+            rig_set_state(r, TAKE_EXPOSING); // until all of it is here
         if (r->purpose == FOR_TAKE) {
             r->ledger.synchronised = r->abilities >= 0 && (r->abilities & TRIGGER_SYNCHRONISED);
             r->ledger.jitter_ns = late_ns;

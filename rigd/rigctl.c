@@ -1,12 +1,14 @@
 // rigd/rigctl.c - the daemon's command line client: one request, one answer, as a table or as JSON.
 //
 // CONTROL.md is the protocol. While a take runs, events of the stream are printed on a terminal, so that people see what happens.
+#include "rigd/rigctl_develop.h"
 #include "solver/take/json.h"
 #include "solver/take/log.h"
 
 #include <argp.h>
 #include <errno.h>
 #include <math.h>
+#include <poll.h>
 #include <stdarg.h>
 #include <stdio.h>
 #include <stdlib.h>
@@ -15,12 +17,15 @@
 #include <sys/un.h>
 #include <unistd.h>
 
-enum { EXIT_DONE = 0, EXIT_FAILED = 1, EXIT_USAGE = 2, LINE_MAX_BYTES = 64 << 20 };
+enum { EXIT_DONE = 0, EXIT_FAILED = 1, EXIT_USAGE = 2, LINE_MAX_BYTES = 64 << 20, OPTION_OPEN = 256, OPTION_MERGE };
 
 struct arguments {
-    const char *socket_path, *name, *again, *word[3];
+    const char *socket_path, *name, *again, *merge, *output, *word[3];
     int n_words, shots;
     bool json, watch, without_missing, cancel, open;
+    int (*without_daemon)(int argc, char **argv, bool json); // with the words from rest on
+    char **rest;
+    int n_rest;
 };
 
 struct line_reader {
@@ -122,6 +127,20 @@ static bool flag_of(const struct json *v, const char *path)
     return b;
 }
 
+static void print_progress(const struct json *p)
+{
+    const char *step = text_of(p, "step"), *text = text_of(p, "text");
+    const double stop = number_of(p, "stop", 0), n_stops = number_of(p, "n_stops", 0);
+    if (!strcmp(step, "turn"))
+        fprintf(stderr, "  stop %.0f of %.0f: to yaw %g, pitch %g\n", stop, n_stops, number_of(p, "yaw_deg", 0), number_of(p, "pitch_deg", 0));
+    else if (!strcmp(step, "expose"))
+        fprintf(stderr, "  stop %.0f of %.0f: exposure %.0f, %s s\n", stop, n_stops, number_of(p, "frame", 0), text_of(p, "exposure"));
+    else if (!strcmp(step, "frame"))
+        fprintf(stderr, "    %s\n", text);
+    else
+        fprintf(stderr, "  stop %.0f of %.0f is done: %s\n", stop, n_stops, text);
+}
+
 // One line when a step changes, another when it is done; how far it has come goes over the line before on a terminal.
 static void print_step_event(const struct json *body)
 {
@@ -152,6 +171,27 @@ static void print_event(const struct json *message)
         fprintf(stderr, "  %s\n", text_of(message, "body.state"));
     else if (!strcmp(event, "say"))
         fprintf(stderr, "  %s: %s\n", text_of(message, "body.severity"), text_of(message, "body.text"));
+    else if (!strcmp(event, "panorama"))
+        print_progress(json_get(message, "body"));
+    else if (!strcmp(event, "prompt") && flag_of(message, "body.on"))
+        fprintf(stderr, "  ==> %s\n", text_of(message, "body.text"));
+}
+
+// A person at this terminal was asked to do something: Enter says that it is done. Until then, or until the daemon says something.
+static bool wait_for_enter(const struct line_reader *r)
+{
+    struct pollfd p[] = { { .fd = 0, .events = POLLIN }, { .fd = r->fd, .events = POLLIN } };
+    char line[256];
+    if (r->n && memchr(r->bytes, '\n', r->n))
+        return false;
+    fputs("      Enter when done: ", stderr);
+    while (poll(p, 2, -1) < 0 && errno == EINTR)
+        ;
+    if (p[1].revents || !fgets(line, sizeof(line), stdin))
+        return false;
+    struct json *done = request_of("continue");
+    json_set_int(done, "id", 2);
+    return send_request(r->fd, done);
 }
 
 // Ask and wait for the answer. events: show what happens meanwhile. NULL: said why.
@@ -169,13 +209,20 @@ static struct json *ask(const struct arguments *a, struct json *request, bool ev
         send_request(r.fd, subscribe);
     }
     send_request(r.fd, request);
+    bool asked = false;
     for (struct json *m; !answer && (m = next_message(&r));) {
         int64_t id = -1;
         const char *about = text_of(m, "body.take"), *take = a->n_words > 1 ? a->word[1] : "";
-        if (json_get(m, "event") && about[0] && take[0] && strcmp(about, take))
+        if (json_get(m, "event") && about[0] && take[0] && strcmp(about, take)) {
             ; // another take's
-        else if (json_get(m, "event"))
+        } else if (json_get(m, "event")) {
             print_event(m);
+            if (!strcmp(text_of(m, "event"), "prompt"))
+                asked = flag_of(m, "body.on") && isatty(0);
+            if (asked)
+                asked = !wait_for_enter(&r);
+        } else if (!json_get_int(m, "id", &id) && id == 2)
+            ;
         else if (!json_get_int(m, "id", &id) && id == 1)
             answer = m;
         else if (json_get(m, "error"))
@@ -219,9 +266,12 @@ static void print_take(const struct json *t)
     printf("take %s: %s", text_of(t, "id"), text_of(t, "state"));
     if (json_get(t, "seconds"))
         printf(" after %.2f s", number_of(t, "seconds", 0));
-    printf("\n  %.0f of %.0f cameras, %.0f frames, %.1f MB", number_of(t, "n_delivered", 0), number_of(t, "n_expected", 0), number_of(t, "n_frames", 0),
+    const bool panorama = !strcmp(text_of(t, "kind"), "panorama");
+    if (panorama)
+        printf("\n  panorama of %.0f stops", number_of(t, "n_stops", 0));
+    printf("\n  %.0f of %.0f %s, %.0f frames, %.1f MB", number_of(t, "n_delivered", 0), number_of(t, "n_expected", 0), panorama ? "exposures" : "cameras", number_of(t, "n_frames", 0),
            1e-6 * number_of(t, "bytes", 0));
-    if (json_get(t, "seconds") && number_of(t, "seconds", 0) > 0)
+    if (!panorama && json_get(t, "seconds") && number_of(t, "seconds", 0) > 0)
         printf(", %.1f MB/s", 1e-6 * number_of(t, "bytes", 0) / number_of(t, "seconds", 1));
     putchar('\n');
     if (json_get(t, "spread_ms"))
@@ -266,6 +316,8 @@ static void print_status(const struct json *s)
            number_of(s, "n_cameras", 0), number_of(s, "n_quarantined", 0), text_of(s, "trigger"));
     if (text_of(s, "outcome")[0])
         printf("last: %s\n", text_of(s, "outcome"));
+    if (text_of(s, "prompt")[0])
+        printf("==> %s\n", text_of(s, "prompt"));
     if (text_of(s, "refusal")[0])
         printf("a take would be refused: %s\n", text_of(s, "refusal"));
     if (text_of(s, "page")[0])
@@ -384,9 +436,81 @@ static int take_result(const struct arguments *a, struct json *request)
 static int capture(const struct arguments *a)
 {
     struct json *r = request_of("capture");
-    json_set_string(r, "name", a->name);
+    json_set_string(r, "name", a->name ? a->name : "take");
     json_set_bool(r, "without_missing", a->without_missing);
     return take_result(a, r);
+}
+
+// The plan of a panorama: that file, a take's folder, or a take that the daemon knows.
+static bool find_plan(const struct arguments *a, char *out, size_t room)
+{
+    struct json *answer = NULL;
+    snprintf(out, room, "%s/panorama/panorama.json", a->merge);
+    if (!access(out, R_OK))
+        return true;
+    snprintf(out, room, "%s", a->merge);
+    if (!access(out, R_OK))
+        return true;
+    if (!strchr(a->merge, '/')) {
+        struct json *r = request_of("report");
+        json_set_string(r, "take", a->merge);
+        answer = ask(a, r, false);
+        if (answer)
+            snprintf(out, room, "%s/panorama/panorama.json", text_of(answer, "result.path"));
+        json_free(answer);
+        return answer && !access(out, R_OK);
+    }
+    return false;
+}
+
+// Offline: rigd-panorama, beside this program.
+static int merge(const struct arguments *a)
+{
+    char program[600], plan[1400];
+    if (!a->output) {
+        fputs("rigctl panorama --merge: expected -o FILE.exr\n", stderr);
+        return EXIT_USAGE;
+    }
+    if (!find_plan(a, plan, sizeof(plan))) {
+        log_error("--merge %s: found neither a panorama.json nor a panorama take", a->merge);
+        return EXIT_FAILED;
+    }
+    ssize_t n = readlink("/proc/self/exe", program, sizeof(program) - 20);
+    while (n > 0 && program[n - 1] != '/')
+        n--;
+    strcpy(program + (n > 0 ? n : 0), "rigd-panorama");
+    execl(program, "rigd-panorama", plan, "-o", a->output, a->json ? "--json" : NULL, NULL);
+    log_error("cannot start %s: %s", program, strerror(errno));
+    return EXIT_FAILED;
+}
+
+static int panorama(const struct arguments *a)
+{
+    struct json *r = request_of("panorama"), *answer;
+    if (a->merge) {
+        json_free(r);
+        return merge(a);
+    }
+    if (a->name)
+        json_set_string(r, "name", a->name);
+    answer = ask(a, r, !a->json); // shown in any case: a person may be asked for something
+    if (!answer)
+        return EXIT_FAILED;
+    const struct json *result = json_get(answer, "result");
+    char *text = a->json ? json_text(result) : NULL;
+    if (a->json)
+        puts(text ? text : "null");
+    else
+        print_take(result);
+    const bool good = !strcmp(text_of(result, "state"), "verified");
+    free(text);
+    json_free(answer);
+    return good ? EXIT_DONE : EXIT_FAILED;
+}
+
+static int go_on(const struct arguments *a)
+{
+    return ask_and_print(a, request_of("continue"), false, NULL, NULL);
 }
 
 static struct json *about_take(const char *what, const char *take)
@@ -625,6 +749,8 @@ static const struct {
     { "doctor", NULL, doctor, "what in this machine will fail before it fails" },
     { "preflight", NULL, preflight, "are all cameras fit for a take?" },
     { "capture", NULL, capture, "make a take; --name, --without-missing" },
+    { "panorama", NULL, panorama, "shoot the lights as an HDR panorama; --name; or --merge PLAN|TAKE -o FILE: without a daemon" },
+    { "continue", NULL, go_on, "what the panorama asked you to do is done" },
     { "cancel", NULL, cancel, "stop a take; after the shot its frames are fetched all the same" },
     { "takes", NULL, takes, "list takes" },
     { "report", "TAKE", report, "one take, camera by camera, and its pages; --open: show the newest" },
@@ -646,8 +772,10 @@ static const struct argp_option option_list[] = {
     { "watch", 'w', NULL, 0, "status: live; process: until it is settled", 0 },
     { "again", 'a', "STEP", 0, "process: make it anew: sheet, develop, panorama, reconstruct, preview, focus, standard, final", 0 },
     { "cancel", 'c', NULL, 0, "process: stop", 0 },
-    { "open", 'o', NULL, 0, "report: show the newest page", 0 },
-    { "name", 'n', "NAME", 0, "capture: of the take", 0 },
+    { "open", OPTION_OPEN, NULL, 0, "report: show the newest page", 0 },
+    { "name", 'n', "NAME", 0, "capture, panorama: of the take", 0 },
+    { "merge", OPTION_MERGE, "PLAN|TAKE", 0, "panorama: make FILE of one that was shot before", 0 },
+    { "output", 'o', "FILE", 0, "panorama --merge: the EXR", 0 },
     { "without-missing", 'm', NULL, 0, "capture: leave cameras out that are not fit", 0 },
     { "shots", 'k', "N", 0, "calibrate: how many (rigd.conf's)", 0 },
     { 0 },
@@ -675,7 +803,13 @@ static error_t parse(int key, char *arg, struct argp_state *state)
     case 'c':
         a->cancel = true;
         return 0;
+    case OPTION_MERGE:
+        a->merge = arg;
+        return 0;
     case 'o':
+        a->output = arg;
+        return 0;
+    case OPTION_OPEN:
         a->open = true;
         return 0;
     case 'm':
@@ -687,6 +821,16 @@ static error_t parse(int key, char *arg, struct argp_state *state)
             argp_error(state, "--shots: found '%s', expected 3 to 1000", arg);
         return 0;
     case ARGP_KEY_ARG:
+        if (a->n_words == 0 && !strcmp(arg, "develop"))
+            a->without_daemon = rigctl_develop;
+        else if (a->n_words == 1 && !strcmp(a->word[0], "calibrate") && !strcmp(arg, "colour"))
+            a->without_daemon = rigctl_calibrate_colour;
+        if (a->without_daemon) { // options after these are their own
+            a->rest = state->argv + state->next - 1;
+            a->n_rest = state->argc - state->next + 1;
+            state->next = state->argc;
+            return 0;
+        }
         if (a->n_words == 2)
             argp_error(state, "found '%s', expected nothing more", arg);
         a->word[a->n_words++] = arg;
@@ -709,6 +853,9 @@ static char *help(int key, const char *text, void *input)
     fputs("Commands:\n", f);
     for (int i = 0; i < N_COMMANDS; i++)
         fprintf(f, "  %-9s %-7s %s\n", commands[i].name, commands[i].operand ? commands[i].operand : "", commands[i].what);
+    fputs("Without a daemon (--help after these tells more):\n"
+          "  develop   RAW...  raw files become linear EXRs\n"
+          "  calibrate colour  one radiometric space for all bodies, from frames of a grey card or chart\n", f);
     fputs("\nExit status: 0 done, 1 failed (a take: not verified), 2 usage.", f);
     fclose(f);
     return out;
@@ -717,12 +864,14 @@ static char *help(int key, const char *text, void *input)
 int main(int argc, char **argv)
 {
     static const struct argp argp = { option_list, parse, "COMMAND [TAKE|CAMERA|lag]", "Talks to rigd, the daemon of the rig.\v", NULL, help, NULL };
-    struct arguments a = { .name = "take" };
+    struct arguments a = { 0 };
     argp_err_exit_status = EXIT_USAGE;
     argp_program_version = "rigctl (studiorig) " STUDIORIG_VERSION;
     log_set_program("rigctl");
     a.socket_path = getenv("RIGD_SOCKET") ? getenv("RIGD_SOCKET") : "/run/rigd/rigd.sock";
-    argp_parse(&argp, argc, argv, 0, NULL, &a);
+    argp_parse(&argp, argc, argv, ARGP_IN_ORDER, NULL, &a);
+    if (a.without_daemon)
+        return a.without_daemon(a.n_rest, a.rest, a.json);
     for (int i = 0; a.n_words && i < N_COMMANDS; i++) {
         if (strcmp(commands[i].name, a.word[0]))
             continue;

@@ -38,14 +38,15 @@ struct panorama_report {
 
 struct stitch;
 int stitch_new(struct stitch **out, int width_px); // 0, -ENOMEM, -EINVAL (not even, not 16 .. 16384)
-// Mosaic -> colours by bilinear interpolation (never below or above its neighbours: no ringing at a lamp), then to texels. 0, -ENOMEM,
+// Mosaic -> colours by bilinear interpolation (never below or above its neighbours: no ringing at a lamp), then to texels. m: after
+// merged_unshade(). 0, -ENOMEM,
 // -EINVAL (the lens is of another size than the picture; logged).
 int stitch_add(struct stitch *s, const struct lens *lens, const double probe_from_camera[9], const struct merged *m, struct stitch_stop_report *report);
-// rgb_from_camera: row-major, applied at the end. Channels R, G, B, "variance.R" "variance.G" "variance.B" (of the texel's mean; camera
-// noise only), "coverage" (1: all of the texel was seen), "clip" (share of the weight that was clipped).
+// rgb_from_camera: row-major, applied at the end. Channels R, G, B, "variance.R" "variance.G" "variance.B" (of the texel's mean, camera
+// noise only: never too small; 15 % too large for texels of 10 pixels, more for smaller ones, because interpolated pixels share sites), "coverage" (1: all of the texel was seen), "clip" (share of the weight that was clipped).
 int stitch_finish(struct image *out, struct stitch *s, const double rgb_from_camera[9], struct panorama_report *report);
 void stitch_free(struct stitch *s); // NULL allowed
 
 // The clipped lights, uncovered directions and sums of a panorama with such channels, or of one without: then a plateau (at least 8 touching
-// texels within 1e-3 of the picture's highest value, where the picture is not flat) counts as clipped.
-void panorama_examine(struct panorama_report *report, const struct image *panorama);
+// texels within 1e-3 of the picture's highest value, where the picture is not flat) counts as clipped. 0 or -ENOMEM.
+int panorama_examine(struct panorama_report *report, const struct image *panorama);

@@ -41,11 +41,37 @@ int image_channel(const struct image *image, const char *name); // index, or -1
 int image_require_finite(const struct image *image, const char *const *names, const char *path);
 
 enum image_type { IMAGE_HALF, IMAGE_FLOAT };
-enum image_compression { IMAGE_ZIP, IMAGE_PIZ };
+enum image_compression { IMAGE_ZIP, IMAGE_PIZ, IMAGE_STORED };
 // Atomic, and the same pixels always give the same bytes. Half rounds to nearest even and saturates at +-65504 (never makes
 // infinities). 0 or -errno (logged): -EDOM for a NaN, -EINVAL for two channels of one name.
 int image_write_exr(const struct image *image, const char *path, enum image_type type,
                     enum image_compression compression);
+// The same from rows that are made one after the other, from the top: pictures larger than memory should hold twice. row fills
+// [width][n_channels] and returns 0 or -errno (which it has logged); notes become attributes of the header.
+struct image_rows {
+    int width, height, n_channels;
+    const char *const *names; // [n_channels]
+    int (*row)(void *arg, int y, float *row);
+    void *arg;
+};
+struct image_note {
+    const char *name, *text; // text NULL: number, kept as float
+    double number;
+};
+int image_write_exr_rows(const struct image_rows *rows, const struct image_note *notes, int n_notes, const char *path,
+                         enum image_type type, enum image_compression compression);
+// 16-bit RGB TIFF, uncompressed, from rows made in the same way (row fills [width][3]), with the usual EXIF; NULL, "" and 0 are left
+// out. Atomic. 0 or -errno (logged).
+struct image_exif {
+    const char *make, *model, *serial, *lens, *description;
+    const char *date, *subseconds; // "2026:11:22 12:34:56", "123"
+    double time_s, f_number, focal_mm, iso;
+};
+int image_write_tiff16(const char *path, int width, int height, const struct image_exif *exif,
+                       int (*row)(void *arg, int y, uint16_t *rgb), void *arg);
+// The text of a note of a scanline EXR whose last lines are there. 0, -errno of the open, -EINVAL (no EXR, or cut short), -ENODATA (no
+// such note, or a number), -EFBIG (room is the size of text). Not logged.
+int image_read_note(const char *path, const char *name, char *text, size_t room);
 // 8-bit PNG, n_channels 1 (grey), 3 or 4; pixels as they are (already encoded). Atomic. 0 or -errno (logged).
 int image_write_png(const char *path, int width, int height, int n_channels, const uint8_t *pixels);
 // The same as bytes in memory, malloc'd, for files that hold pictures. 0, -EINVAL, -ENOMEM (logged).

@@ -411,15 +411,11 @@ static int64_t write_bytes(exr_const_context_t context, void *user, const void *
     return (int64_t)n;
 }
 
-static int refuse_nan(const struct image *image, const char *path)
+static int refuse_nan(const struct image_rows *image, const char *path, int y, const float *row)
 {
-    const int64_t n = (int64_t)image->width * image->height * image->n_channels;
-    for (int64_t i = 0; i < n; i++)
-        if (isnan(image->data[i])) {
-            const int64_t pixel = i / image->n_channels;
-            log_error("image: %s not written: channel %s is NaN at column %d, row %d", path,
-                      image->names[i % image->n_channels], (int)(pixel % image->width),
-                      (int)(pixel / image->width));
+    for (int64_t i = 0; i < (int64_t)image->width * image->n_channels; i++)
+        if (isnan(row[i])) {
+            log_error("image: %s not written: channel %s is NaN at column %d, row %d", path, image->names[i % image->n_channels], (int)(i / image->n_channels), y);
             return -EDOM;
         }
     return 0;
@@ -427,7 +423,7 @@ static int refuse_nan(const struct image *image, const char *path)
 
 // EXR wants channels in the order of their names: order[i] is the image's channel of the file's
 // i-th.
-static int sort_channels(const struct image *image, const char *path, int order[IMAGE_MAX_CHANNELS])
+static int sort_channels(const struct image_rows *image, const char *path, int order[IMAGE_MAX_CHANNELS])
 {
     for (int c = 0; c < image->n_channels; c++) {
         int i = c;
@@ -442,47 +438,68 @@ static int sort_channels(const struct image *image, const char *path, int order[
     return 0;
 }
 
-static exr_result_t write_header(exr_context_t context, const struct image *image,
-                                 const int order[IMAGE_MAX_CHANNELS], enum image_type type,
-                                 enum image_compression compression)
+static exr_result_t write_notes(exr_context_t context, int part, const struct image_note *notes, int n_notes)
 {
+    exr_result_t code = EXR_ERR_SUCCESS;
+    for (int i = 0; i < n_notes && code == EXR_ERR_SUCCESS; i++)
+        code = notes[i].text ? exr_attr_set_string(context, part, notes[i].name, notes[i].text)
+                             : exr_attr_set_float(context, part, notes[i].name, (float)notes[i].number);
+    return code;
+}
+
+static exr_result_t write_header(exr_context_t context, const struct image_rows *image, const int order[IMAGE_MAX_CHANNELS],
+                                 enum image_type type, enum image_compression compression, const struct image_note *notes, int n_notes)
+{
+    static const exr_compression_t method[] = { [IMAGE_ZIP] = EXR_COMPRESSION_ZIP, [IMAGE_PIZ] = EXR_COMPRESSION_PIZ, [IMAGE_STORED] = EXR_COMPRESSION_NONE };
     int part = 0;
     exr_result_t code = exr_set_longname_support(context, 1);
     if (code == EXR_ERR_SUCCESS)
         code = exr_add_part(context, NULL, EXR_STORAGE_SCANLINE, &part);
     if (code == EXR_ERR_SUCCESS)
-        code = exr_initialize_required_attr_simple(context, part, image->width, image->height,
-                                                   compression == IMAGE_PIZ ? EXR_COMPRESSION_PIZ
-                                                                            : EXR_COMPRESSION_ZIP);
+        code = exr_initialize_required_attr_simple(context, part, image->width, image->height, method[compression]);
     for (int i = 0; i < image->n_channels && code == EXR_ERR_SUCCESS; i++)
         code = exr_add_channel(context, part, image->names[order[i]],
                                type == IMAGE_HALF ? EXR_PIXEL_HALF : EXR_PIXEL_FLOAT,
                                EXR_PERCEPTUALLY_LOGARITHMIC, 1, 1);
+    if (code == EXR_ERR_SUCCESS)
+        code = write_notes(context, part, notes, n_notes);
     return code == EXR_ERR_SUCCESS ? exr_write_header(context) : code;
 }
 
-static exr_result_t write_lines(exr_context_t context, const struct image *image,
-                                const int order[IMAGE_MAX_CHANNELS], enum image_type type, int step,
-                                exr_encode_pipeline_t *encode, uint16_t *half)
+// A chunk's rows, asked for in order: as floats in from, as halves in half (NULL: not wanted).
+struct row_buffer {
+    float *from;
+    uint16_t *half;
+    int err; // -errno of who makes the rows
+};
+
+static exr_result_t write_lines(exr_context_t context, const struct image_rows *image, const char *path, const int order[IMAGE_MAX_CHANNELS],
+                                int step, exr_encode_pipeline_t *encode, struct row_buffer *buffer)
 {
     const size_t n_row = (size_t)image->width * (size_t)image->n_channels;
-    const int sample_bytes = type == IMAGE_HALF ? 2 : 4;
+    const int sample_bytes = buffer->half ? 2 : 4;
     for (int y = 0; y < image->height; y += step) {
         exr_chunk_info_t chunk;
-        const float *from = image->data + (size_t)y * n_row;
-        const size_t n_lines = (size_t)(image->height - y < step ? image->height - y : step);
+        const int n_lines = image->height - y < step ? image->height - y : step;
+        for (int i = 0; i < n_lines && !buffer->err; i++) {
+            buffer->err = image->row(image->arg, y + i, buffer->from + (size_t)i * n_row);
+            if (!buffer->err)
+                buffer->err = refuse_nan(image, path, y + i, buffer->from + (size_t)i * n_row);
+        }
+        if (buffer->err)
+            return EXR_ERR_INVALID_ARGUMENT;
         exr_result_t code = exr_write_scanline_chunk_info(context, 0, y, &chunk);
         if (code == EXR_ERR_SUCCESS)
             code = y == 0 ? exr_encoding_initialize(context, 0, &chunk, encode)
                           : exr_encoding_update(context, 0, &chunk, encode);
         if (code != EXR_ERR_SUCCESS)
             return code;
-        for (size_t i = 0; half && i < n_lines * n_row; i++)
-            half[i] = half_from_float(from[i]);
-        const uint8_t *bytes = half ? (const uint8_t *)half : (const uint8_t *)from;
+        for (size_t i = 0; buffer->half && i < (size_t)n_lines * n_row; i++)
+            buffer->half[i] = half_from_float(buffer->from[i]);
+        const uint8_t *bytes = buffer->half ? (const uint8_t *)buffer->half : (const uint8_t *)buffer->from;
         for (int i = 0; i < image->n_channels; i++) {
             exr_coding_channel_info_t *channel = &encode->channels[i];
-            channel->user_data_type = type == IMAGE_HALF ? EXR_PIXEL_HALF : EXR_PIXEL_FLOAT;
+            channel->user_data_type = buffer->half ? EXR_PIXEL_HALF : EXR_PIXEL_FLOAT;
             channel->user_bytes_per_element = (int16_t)sample_bytes;
             channel->user_pixel_stride = image->n_channels * sample_bytes;
             channel->user_line_stride = (int32_t)n_row * sample_bytes;
@@ -498,20 +515,18 @@ static exr_result_t write_lines(exr_context_t context, const struct image *image
     return EXR_ERR_SUCCESS;
 }
 
-int image_write_exr(const struct image *image, const char *path, enum image_type type,
-                    enum image_compression compression)
+int image_write_exr_rows(const struct image_rows *image, const struct image_note *notes, int n_notes, const char *path,
+                         enum image_type type, enum image_compression compression)
 {
     struct atomic_file f = { 0 };
     struct stream stream = { .fd = -1 };
+    struct row_buffer buffer = { 0 };
     exr_context_t context = NULL;
     exr_encode_pipeline_t encode = EXR_ENCODE_PIPELINE_INITIALIZER;
     exr_context_initializer_t settings = EXR_DEFAULT_CONTEXT_INITIALIZER;
-    uint16_t *half = NULL;
     int32_t step = 0;
     int order[IMAGE_MAX_CHANNELS];
-    int err = refuse_nan(image, path);
-    if (!err)
-        err = sort_channels(image, path, order);
+    int err = sort_channels(image, path, order);
     if (!err)
         err = atomic_file_open(&f, path);
     if (err)
@@ -523,23 +538,29 @@ int image_write_exr(const struct image *image, const char *path, enum image_type
 
     exr_result_t code = exr_start_write(&context, path, EXR_WRITE_FILE_DIRECTLY, &settings);
     if (code == EXR_ERR_SUCCESS)
-        code = write_header(context, image, order, type, compression);
+        code = write_header(context, image, order, type, compression, notes, n_notes);
     if (code == EXR_ERR_SUCCESS)
         code = exr_get_scanlines_per_chunk(context, 0, &step);
-    if (code == EXR_ERR_SUCCESS && type == IMAGE_HALF) {
-        half =
-            malloc((size_t)step * (size_t)image->width * (size_t)image->n_channels * sizeof(*half));
-        if (!half)
+    if (code == EXR_ERR_SUCCESS) {
+        const size_t n = (size_t)step * (size_t)image->width * (size_t)image->n_channels;
+        buffer.from = malloc(n * sizeof(buffer.from[0]));
+        buffer.half = type == IMAGE_HALF ? malloc(n * sizeof(buffer.half[0])) : NULL;
+        if (!buffer.from || (type == IMAGE_HALF && !buffer.half))
             code = EXR_ERR_OUT_OF_MEMORY;
     }
     if (code == EXR_ERR_SUCCESS)
-        code = write_lines(context, image, order, type, step, &encode, half);
-    free(half);
+        code = write_lines(context, image, path, order, step, &encode, &buffer);
+    free(buffer.from);
+    free(buffer.half);
     if (context) {
         exr_encoding_destroy(context, &encode);
         const exr_result_t finish_code = exr_finish(&context); // writes the table of chunks
         if (code == EXR_ERR_SUCCESS)
             code = finish_code;
+    }
+    if (buffer.err) { // said where it happened
+        atomic_file_abandon(&f);
+        return buffer.err;
     }
     if (code != EXR_ERR_SUCCESS || stream.write_err) {
         err = stream.write_err ? stream.write_err : errno_of(code);
@@ -551,4 +572,76 @@ int image_write_exr(const struct image *image, const char *path, enum image_type
         return err;
     }
     return atomic_file_commit(&f);
+}
+
+static int row_of_image(void *arg, int y, float *row)
+{
+    const struct image *image = arg;
+    const size_t n_row = (size_t)image->width * (size_t)image->n_channels;
+    memcpy(row, image->data + (size_t)y * n_row, n_row * sizeof(row[0]));
+    return 0;
+}
+
+int image_write_exr(const struct image *image, const char *path, enum image_type type, enum image_compression compression)
+{
+    const char *names[IMAGE_MAX_CHANNELS];
+    for (int c = 0; c < image->n_channels; c++)
+        names[c] = image->names[c];
+    return image_write_exr_rows(&(struct image_rows){ image->width, image->height, image->n_channels, names, row_of_image, (void *)(uintptr_t)image },
+                                NULL, 0, path, type, compression);
+}
+
+// ---- notes ----------------------------------------------------------------------------------
+
+// The table of chunks says where each lies; the last one's bytes are there if the file was not cut.
+static int check_last_chunk(exr_context_t context)
+{
+    exr_attr_box2i_t window;
+    exr_chunk_info_t chunk;
+    exr_storage_t storage;
+    int32_t step = 0;
+    if (exr_get_storage(context, 0, &storage) || storage != EXR_STORAGE_SCANLINE || exr_get_data_window(context, 0, &window) ||
+        exr_get_scanlines_per_chunk(context, 0, &step) || step < 1 || window.max.y < window.min.y)
+        return -EINVAL;
+    const int64_t last = window.min.y + ((int64_t)window.max.y - window.min.y) / step * step;
+    exr_result_t code = exr_read_scanline_chunk_info(context, 0, (int)last, &chunk);
+    char *packed = code == EXR_ERR_SUCCESS && chunk.packed_size < (uint64_t)1 << 30 ? malloc(chunk.packed_size ? chunk.packed_size : 1) : NULL;
+    if (packed)
+        code = exr_read_chunk(context, 0, &chunk, packed);
+    else
+        code = code == EXR_ERR_SUCCESS ? EXR_ERR_CORRUPT_CHUNK : code;
+    free(packed);
+    return code == EXR_ERR_SUCCESS ? 0 : -EINVAL;
+}
+
+static void ignore_message(exr_const_context_t context, exr_result_t code, const char *message)
+{
+    (void)context, (void)code, (void)message;
+}
+
+int image_read_note(const char *path, const char *name, char *text, size_t room)
+{
+    exr_context_t context = NULL;
+    exr_context_initializer_t settings = EXR_DEFAULT_CONTEXT_INITIALIZER;
+    int32_t n = 0;
+    const char *found = NULL;
+    text[0] = 0;
+    if (access(path, R_OK))
+        return -errno;
+    settings.error_handler_fn = ignore_message;
+    settings.flags = EXR_CONTEXT_FLAG_DISABLE_CHUNK_RECONSTRUCTION;
+    settings.max_image_width = LIBRARY_MAX_SIDE_PX;
+    settings.max_image_height = LIBRARY_MAX_SIDE_PX;
+    int err = exr_start_read(&context, path, &settings) == EXR_ERR_SUCCESS ? check_last_chunk(context) : -EINVAL;
+    if (!err && exr_attr_get_string(context, 0, name, &n, &found) != EXR_ERR_SUCCESS)
+        err = -ENODATA;
+    if (!err && (n < 0 || (size_t)n >= room))
+        err = -EFBIG;
+    if (!err) {
+        memcpy(text, found, (size_t)n);
+        text[n] = 0;
+    }
+    if (context)
+        exr_finish(&context);
+    return err;
 }

@@ -1,5 +1,6 @@
-// solver/take/image_tiff.c - TIFF in: linear 8/16-bit and float pictures from raw developers
+// solver/take/image_tiff.c - TIFF in: linear 8/16-bit and float pictures from raw developers; out: 16-bit with EXIF
 // (libtiff appears only here).
+#include "solver/take/atomic_file.h"
 #include "solver/take/image_formats.h"
 #include "solver/take/log.h"
 
@@ -7,6 +8,7 @@
 #include <stdlib.h>
 #include <string.h>
 #include <tiffio.h>
+#include <unistd.h>
 
 enum { MAX_TILE_SIDE_PX = 65536 };
 
@@ -283,5 +285,141 @@ int image_read_tiff(struct image *out, const struct image_file *file)
         image_free(&image);
     else
         *out = image;
+    return err;
+}
+
+// ---- writing --------------------------------------------------------------------------------
+
+struct tiff_out {
+    int fd, err; // -errno of the first write that failed
+    char message[200];
+    off_t at;
+};
+
+static tmsize_t out_write(thandle_t user, void *buffer, tmsize_t n)
+{
+    struct tiff_out *t = user;
+    for (tmsize_t done = 0; done < n;) {
+        const ssize_t got = pwrite(t->fd, (const char *)buffer + done, (size_t)(n - done), t->at);
+        if (got < 0 && errno == EINTR)
+            continue;
+        if (got <= 0) {
+            t->err = got < 0 ? -errno : -EIO;
+            return -1;
+        }
+        done += got;
+        t->at += got;
+    }
+    return n;
+}
+
+static tmsize_t out_read(thandle_t user, void *buffer, tmsize_t n)
+{
+    struct tiff_out *t = user;
+    const ssize_t got = pread(t->fd, buffer, (size_t)n, t->at);
+    t->at += got > 0 ? got : 0;
+    return got;
+}
+
+static toff_t out_size(thandle_t user)
+{
+    const off_t end = lseek(((struct tiff_out *)user)->fd, 0, SEEK_END);
+    return end < 0 ? 0 : (toff_t)end;
+}
+
+static toff_t out_seek(thandle_t user, toff_t offset, int whence)
+{
+    struct tiff_out *t = user;
+    t->at = (off_t)offset + (whence == SEEK_CUR ? t->at : whence == SEEK_END ? (off_t)out_size(t) : 0);
+    return (toff_t)t->at;
+}
+
+static int keep_out_error(TIFF *handle, void *user, const char *module, const char *format, va_list args)
+{
+    struct tiff_out *t = user;
+    (void)handle, (void)module;
+    if (!t->message[0])
+        vsnprintf(t->message, sizeof(t->message), format, args);
+    return 1;
+}
+
+static int pass_out_warning(TIFF *handle, void *user, const char *module, const char *format, va_list args)
+{
+    (void)handle, (void)user, (void)module, (void)format, (void)args;
+    return 1;
+}
+
+static bool set_text(TIFF *t, uint32_t tag, const char *text)
+{
+    return !text || !text[0] || TIFFSetField(t, tag, text);
+}
+
+static bool set_number(TIFF *t, uint32_t tag, double v)
+{
+    return !(v > 0) || TIFFSetField(t, tag, v);
+}
+
+// An EXIF directory of its own; *at is where it lies.
+static bool write_exif(TIFF *t, const struct image_exif *e, uint64_t *at)
+{
+    const uint16_t iso = (uint16_t)(e->iso < 65535 ? e->iso + .5 : 65535);
+    bool ok = TIFFCreateEXIFDirectory(t) == 0 && TIFFSetField(t, EXIFTAG_EXIFVERSION, "0231");
+    ok = ok && set_number(t, EXIFTAG_EXPOSURETIME, e->time_s) && set_number(t, EXIFTAG_FNUMBER, e->f_number);
+    ok = ok && (!iso || TIFFSetField(t, EXIFTAG_ISOSPEEDRATINGS, 1, &iso));
+    ok = ok && set_text(t, EXIFTAG_DATETIMEORIGINAL, e->date) && set_text(t, EXIFTAG_SUBSECTIMEORIGINAL, e->subseconds);
+    ok = ok && set_number(t, EXIFTAG_FOCALLENGTH, e->focal_mm) && set_text(t, EXIFTAG_BODYSERIALNUMBER, e->serial) &&
+         set_text(t, EXIFTAG_LENSMODEL, e->lens) && TIFFWriteCustomDirectory(t, at);
+    if (ok) { // libtiff would drop the EXIF directory's texts
+        TIFFFreeDirectory(t);
+        ok = TIFFCreateDirectory(t) == 0;
+    }
+    return ok;
+}
+
+static bool write_main(TIFF *t, int width, int height, const struct image_exif *e, uint64_t exif_at)
+{
+    bool ok = TIFFSetField(t, TIFFTAG_IMAGEWIDTH, width) && TIFFSetField(t, TIFFTAG_IMAGELENGTH, height);
+    ok = ok && TIFFSetField(t, TIFFTAG_BITSPERSAMPLE, 16) && TIFFSetField(t, TIFFTAG_SAMPLESPERPIXEL, 3);
+    ok = ok && TIFFSetField(t, TIFFTAG_COMPRESSION, COMPRESSION_NONE) && TIFFSetField(t, TIFFTAG_PHOTOMETRIC, PHOTOMETRIC_RGB);
+    ok = ok && TIFFSetField(t, TIFFTAG_PLANARCONFIG, PLANARCONFIG_CONTIG) && TIFFSetField(t, TIFFTAG_ORIENTATION, ORIENTATION_TOPLEFT);
+    ok = ok && TIFFSetField(t, TIFFTAG_ROWSPERSTRIP, 16) && set_text(t, TIFFTAG_MAKE, e->make) && set_text(t, TIFFTAG_MODEL, e->model);
+    ok = ok && set_text(t, TIFFTAG_IMAGEDESCRIPTION, e->description) && set_text(t, TIFFTAG_DATETIME, e->date);
+    return ok && TIFFSetField(t, TIFFTAG_EXIFIFD, exif_at);
+}
+
+int image_write_tiff16(const char *path, int width, int height, const struct image_exif *exif,
+                       int (*row)(void *arg, int y, uint16_t *rgb), void *arg)
+{
+    struct atomic_file f;
+    uint64_t exif_at = 0;
+    int err = atomic_file_open(&f, path), row_err = 0;
+    if (err)
+        return err;
+    struct tiff_out out = { .fd = fileno(f.stream) };
+    TIFFOpenOptions *options = TIFFOpenOptionsAlloc();
+    uint16_t *rgb = malloc((size_t)width * 3 * sizeof(*rgb));
+    if (options) {
+        TIFFOpenOptionsSetErrorHandlerExtR(options, keep_out_error, &out);
+        TIFFOpenOptionsSetWarningHandlerExtR(options, pass_out_warning, &out);
+    }
+    TIFF *t = options && rgb ? TIFFClientOpenExt(path, "w", &out, out_read, out_write, out_seek, close_nothing, out_size, map_nothing, unmap_nothing, options)
+                             : NULL;
+    bool ok = t && write_exif(t, exif, &exif_at) && write_main(t, width, height, exif, exif_at);
+    for (int y = 0; ok && y < height; y++) {
+        row_err = row(arg, y, rgb);
+        ok = !row_err && TIFFWriteScanline(t, rgb, (uint32_t)y, 0) == 1;
+    }
+    ok = ok && TIFFWriteDirectory(t);
+    if (t)
+        TIFFClose(t);
+    if (options)
+        TIFFOpenOptionsFree(options);
+    free(rgb);
+    if (ok && !out.err)
+        return atomic_file_commit(&f);
+    err = row_err ? row_err : out.err ? out.err : rgb && options ? -EINVAL : -ENOMEM;
+    if (!row_err)
+        log_error("image: cannot write %s: %s", path, out.err ? strerror(-out.err) : out.message[0] ? out.message : "out of memory");
+    atomic_file_abandon(&f);
     return err;
 }

@@ -99,12 +99,15 @@ static int family(enum property_role role)
 static double setting(const struct body *b, int which, double fallback)
 {
     const struct personality *p = b->personality;
-    for (int i = 0; i < p->n_properties; i++)
+    double found = fallback;
+    bool exact = false; // in 0.1 ms, 1/4000 and 1/5000 look alike
+    for (int i = 0; i < p->n_properties && !exact; i++)
         if (family(p->property[i].role) == which) {
             const double v = meaning(p, p->property[i].role, b->value[i]);
-            return v > 0 ? v : fallback;
+            found = v > 0 ? v : fallback;
+            exact = p->property[i].role != ROLE_SHUTTER_100US;
         }
-    return fallback;
+    return found;
 }
 
 int body_iso(const struct body *b)

@@ -10,7 +10,7 @@
 #include <stdlib.h>
 #include <string.h>
 
-enum { STREAM_NOISE = 0x6e6f69, NORMALS = 4096, JPEG_WIDTH = 640, THUMB_WIDTH = 160, FOCAL_MM = 50 };
+enum { STREAM_NOISE = 0x6e6f69, STREAM_GAIN = 0x6761696e, NORMALS = 4096, JPEG_WIDTH = 640, THUMB_WIDTH = 160, FOCAL_MM = 50 };
 
 _Static_assert(__BYTE_ORDER__ == __ORDER_LITTLE_ENDIAN__, "rows go into the file as they lie in memory");
 
@@ -87,6 +87,12 @@ static double relative_exposure(const struct personality *p, const struct exposu
     return e->time_s / p->t_ref_s * (p->n_ref / e->f_number) * (p->n_ref / e->f_number);
 }
 
+// Of this body, channel c: lens, filter and sensor are never quite the same twice.
+static double body_gain(const struct body *b, int c)
+{
+    return exp(b->personality->gain_spread * random_normal(b->seed, STREAM_GAIN, 3 * (uint64_t)b->index + (uint64_t)c));
+}
+
 static uint8_t srgb8(double v)
 {
     v = v <= 0 ? 0 : v >= 1 ? 1 : v <= .0031308 ? 12.92 * v : 1.055 * pow(v, 1 / 2.4) - .055;
@@ -136,7 +142,7 @@ int frame_open(struct frame **out, struct scene *scene, const struct body *b, co
                          .read_variance = (float)(p->read_noise_e * p->read_noise_e) };
     f->dn_per_electron = (float)((p->white_level - p->black_level) / p->full_well_e * e->iso / 100);
     for (int c = 0; c < 3; c++)
-        f->electrons[c] = (float)(p->full_well_e * p->wb[c] * relative_exposure(p, e));
+        f->electrons[c] = (float)(p->full_well_e * p->wb[c] * relative_exposure(p, e) * body_gain(b, c));
     if (file == FILES_JPEG) {
         err = develop(&f->jpeg, scene, b, e, JPEG_WIDTH);
     } else {

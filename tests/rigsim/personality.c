@@ -53,6 +53,7 @@ static const struct key {
     { "white_level", KEY_INT, FIELD(white_level), 8192, 16383 },
     { "full_well_e", KEY_NUMBER, FIELD(full_well_e), 100, 1e7 },
     { "read_noise_e", KEY_NUMBER, FIELD(read_noise_e), 0, 1000 },
+    { "gain_spread", KEY_NUMBER, FIELD(gain_spread), 0, .5 },
     { "wb", KEY_WB, FIELD(wb), .01, 1 },
     { "t_ref_s", KEY_NUMBER, FIELD(t_ref_s), 1e-6, 1000 },
     { "n_ref", KEY_NUMBER, FIELD(n_ref), .5, 100 },

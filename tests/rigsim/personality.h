@@ -85,6 +85,7 @@ struct personality {
     int black_level, white_level; // DN of 14 bits
     double full_well_e;           // electrons at white_level, ISO 100
     double read_noise_e;
+    double gain_spread;           // sigma between bodies of what each channel gathers, relative; 0
     double wb[3];                 // response of R, G, B to a white of linear sRGB; the largest is 1
     double t_ref_s, n_ref;        // scene value 1 is white_level at ISO 100, this time (power of two) and f-number
 
