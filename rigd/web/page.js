@@ -150,8 +150,9 @@ function showNow() {
     setText($("state"), sentence(text));
     $("prompt").hidden = !rig.prompt;
     setText($("prompt"), rig.prompt || "");
-    $("progress").max = take && take.n_expected ? take.n_expected : 1;
-    $("progress").value = take ? take.n_delivered : 0;
+    const turning = take && head && head.take === take.id;
+    $("progress").max = turning ? head.n_stops : take && take.n_expected ? take.n_expected : 1;
+    $("progress").value = turning ? head.stop - 1 : take ? take.n_delivered : 0;
 }
 
 // What is made of takes now: develop: 3 of 12; preview: waiting.
@@ -222,7 +223,7 @@ function showCamera(data) {
     set("port", (data.model ? data.model + ", " : "") + data.port);
     set("note", data.note || "");
     card.querySelectorAll("button")[1].hidden = data.condition !== "quarantined";
-    if (data.doing === "fetch" && rig && rig.take) showPicture(c, rig.take.id); // a thumbnail comes before its raw
+    if (data.doing === "fetch" && rig && rig.take && rig.take.kind !== "panorama") showPicture(c, rig.take.id); // a thumbnail comes before its raw
 }
 
 function showPicture(c, take) {
@@ -234,7 +235,7 @@ function showPicture(c, take) {
 
 // The last take's, once it has ended; after a new start of rigd the newest there is.
 function showPictures() {
-    const take = rig && rig.take && rig.take.id ? rig.take : takes[0];
+    const take = rig && rig.take && rig.take.kind !== "panorama" ? rig.take : takes.find(t => t.kind !== "panorama");
     if (take && ENDED.includes(take.state)) for (const c of cameras.values()) showPicture(c, take.id);
 }
 
@@ -246,7 +247,7 @@ function showTake(take) {
     li.append(element("h3", take.name), element("p", new Date(take.created).toLocaleString() + ", " + take.id, "faint"));
     const state = element("b", take.state, take.state === "failed" ? "bad" : "good");
     const figures = element("p");
-    figures.append(state, ": " + take.n_delivered + " of " + take.n_expected + " cameras, " + take.n_frames + " frames, " + megabytes(take.bytes) +
+    figures.append(state, ": " + take.n_delivered + " of " + take.n_expected + (take.kind === "panorama" ? " exposures, " : " cameras, ") + take.n_frames + " frames, " + megabytes(take.bytes) +
         (take.spread_ms !== undefined ? ", shutters within " + take.spread_ms.toFixed(2) + " ms" : ""));
     li.append(figures);
     if (take.reason) li.append(element("p", sentence(take.reason), "bad"));
@@ -382,6 +383,6 @@ $("capture-form").onsubmit = capture;
 $("leave-out").onchange = showButtons;
 $("cancel").onclick = () => press({ do: "cancel" }, () => showOutcome("cancelled; frames that were exposed are fetched all the same"));
 $("preflight").onclick = preflight;
-$("panorama").onclick = () => press({ do: "panorama" }, () => showOutcome("the panorama is taken"));
+$("panorama").onclick = () => press({ do: "panorama" }, showEnd);
 $("continue").onclick = () => press({ do: "continue" });
 connect();
