@@ -5,8 +5,9 @@
 // and a line that the INI reader would cut (200 characters; section names 49).
 #pragma once
 #include "rigd/camera.h"
+#include "rigd/lens.h"
 
-enum { CONFIG_CAMERAS_MAX = 256, CONFIG_NONE = -1 };
+enum { CONFIG_CAMERAS_MAX = 256, CONFIG_NONE = -1, CONFIG_STOPS_MAX = 64, CONFIG_FRAMES_MAX = 32 };
 
 struct config_camera {       // [camera "A01"]
     char name[24];           // letters, digits, - and _: it names files
@@ -40,6 +41,53 @@ struct trigger_config {      // [trigger]
     uint32_t max_hold_ms;    // no line stays pressed longer, whatever anyone asks; at most 10000
 };
 
+enum develop_quality { DEVELOP_AHD, DEVELOP_BILINEAR, DEVELOP_HALF };
+enum solve_then { SOLVE_THEN_OFF, SOLVE_THEN_STANDARD, SOLVE_THEN_FINAL };
+
+// What happens once the frames are here. Without a [develop] section: nothing; without [solve]: no solve.
+struct process_config {
+    // [develop]
+    bool develop;             // after = on
+    enum develop_quality demosaic;
+    char flat[256];           // frame of an even white, or folder of <camera>.exr; "": none
+    char colour[256];         // gains and scales of all bodies (rigctl calibrate colour), or folder of <camera>.json; "": none
+    int develop_jobs;         // frames at a time; 0: one per core
+    uint32_t memory_mb;       // of developing; 0: half of what the machine has
+    uint32_t develop_timeout_s, panorama_timeout_s;
+    // [reconstruct]
+    char command[190];        // words; the take's path is added. "": none
+    char calibrated[256];     // a fixed rig's mesh.*, cameras and start.json; "": none
+    uint32_t reconstruct_timeout_s;
+    // [solve]
+    bool preview;
+    enum solve_then then;
+    char options[190];        // words for rigsolve solve
+    int solve_threads;        // 0: all cores
+    char solve_program[256];  // "": rigsolve beside rigd
+    uint32_t solve_timeout_s;
+};
+
+enum head_kind { HEAD_NONE, HEAD_MANUAL, HEAD_BOARD }; // the camera stays where it is | a person turns it | the trigger does
+
+struct config_stop { double yaw_deg, pitch_deg; }; // as trigger_head(): yaw to the left seen from above, pitch up
+
+struct panorama_config {     // [panorama]
+    char camera_name[24];    // "": there is no [panorama]
+    int camera;              // its number: config_panorama_camera()
+    enum head_kind head;
+    struct lens lens;
+    double max_angle_deg;
+    double nodal_offset_m;   // entrance pupil in front of the point about which the head turns
+    double overlap;          // of neighbouring stops, where they are planned and not listed
+    int n_stops;
+    struct config_stop stop[CONFIG_STOPS_MAX];
+    double meter_s;          // first exposure of each stop; labels as on the dial, as in setting.shutter
+    double shortest_s, longest_s; // no exposure beyond
+    int frames_max;          // per stop; at most CONFIG_FRAMES_MAX
+    uint32_t settle_ms;      // from the head's rest to the first exposure
+    double neutral_density_ev; // of a filter in front of the lens
+};
+
 struct config {
     // [rig]
     char name[64];
@@ -61,9 +109,17 @@ struct config {
     int calibration_shots;
     double lag_max_std_ms;
     struct trigger_config trigger;
+    struct process_config process;
+    struct panorama_config panorama;
     int n_cameras;
     struct config_camera *camera; // in the file's order: the camera numbers of all of rigd
 };
+
+// The number of the camera that makes panoramas and takes no part in ordinary takes. CONFIG_NONE: there is none.
+static inline int config_panorama_camera(const struct config *c)
+{
+    return c->panorama.camera_name[0] ? c->panorama.camera : CONFIG_NONE;
+}
 
 // 0; -ENOENT..., -EINVAL (every finding logged, at most 20). *out is zeroed on failure.
 int config_read(struct config *out, const char *path);

@@ -66,6 +66,7 @@ struct json *describe_status(const struct rig *rig, const struct config *config,
     json_set_string(o, "state", take_state_name(rig_state(rig)));
     json_set_bool(o, "busy", rig_is_busy(rig));
     put(o, "outcome", rig_outcome(rig));
+    put(o, "prompt", rig_prompt(rig));
     json_set_string(o, "trigger", trigger);
     json_set_string(o, "takes_dir", config->takes_dir);
     if (l)
@@ -124,6 +125,33 @@ struct json *describe_lag(const struct rig *rig, const struct config *config)
     return o;
 }
 
+static struct json *describe_processing(const struct ledger *l)
+{
+    static const char *const words[LEDGER_N_PROCESSING] = { "none", "owed", "settled", "cancelled" };
+    struct json *o = json_new_object(), *notes = json_new_array(), *solves = json_new_array();
+    int n_developed = 0;
+    for (int i = 0; i < l->n_cameras; i++)
+        n_developed += l->camera[i].developed[0] != 0;
+    json_set_string(o, "state", words[l->processing]);
+    json_set_int(o, "n_developed", n_developed);
+    put(o, "panorama_from", l->panorama_from);
+    for (int i = 0; i < l->n_notes; i++)
+        json_append_string(notes, l->process_note[i]);
+    for (int i = 0; i < l->n_solves; i++) {
+        struct json *e = json_new_object();
+        json_set_string(e, "name", l->solve[i].name);
+        json_set_bool(e, "trusted", l->solve[i].trusted);
+        if (!isnan(l->solve[i].rmse_held_out_percent))
+            json_set_number(e, "rmse_held_out_percent", l->solve[i].rmse_held_out_percent);
+        json_set_number(e, "seconds", l->solve[i].seconds);
+        put(e, "why", l->solve[i].why);
+        json_append(solves, e);
+    }
+    json_set(o, "notes", notes);
+    json_set(o, "solves", solves);
+    return o;
+}
+
 struct json *describe_take(const struct ledger *l, bool with_cameras)
 {
     struct json *o = json_new_object(), *list = json_new_array(), *missing = json_new_array(), *left_out = json_new_array();
@@ -138,7 +166,7 @@ struct json *describe_take(const struct ledger *l, bool with_cameras)
                 n_frames++;
                 bytes += c->object[k].object.size_bytes;
             }
-        if (!c->expected || c->debt == DEBT_MISSED) {
+        if (!c->expected ? c->note[0] : c->debt == DEBT_MISSED) { // without a note: no part of this take
             struct json *e = json_new_object();
             json_set_string(e, "camera", c->name);
             json_set_string(e, "port", c->port);
@@ -151,6 +179,10 @@ struct json *describe_take(const struct ledger *l, bool with_cameras)
         json_set_string(e, "camera", c->name);
         put(e, "serial", c->serial);
         put(e, "note", c->note);
+        if (c->is_exposure) {
+            json_set_int(e, "stop", c->exposure.stop + 1);
+            json_set_string(e, "exposure", c->exposure.label);
+        }
         json_set_int(e, "delay_us", c->delay_us);
         if (c->lag_ns != INT64_MIN)
             json_set_number(e, "lag_ms", 1e-6 * (double)c->lag_ns);
@@ -163,6 +195,11 @@ struct json *describe_take(const struct ledger *l, bool with_cameras)
             json_append(files, f);
         }
         json_set(e, "files", files);
+        if (c->developed[0]) {
+            json_set_string(e, "developed", c->developed);
+            json_set_number(e, "clipped_share", c->clipped_share);
+            json_set_number(e, "developed_s", c->developed_s);
+        }
         json_append(list, e);
     }
     json_set_string(o, "id", l->id);
@@ -170,6 +207,10 @@ struct json *describe_take(const struct ledger *l, bool with_cameras)
     json_set_string(o, "created", l->created);
     json_set_string(o, "state", take_state_name(l->state));
     put(o, "reason", l->reason);
+    json_set_string(o, "kind", l->kind == TAKE_PANORAMA ? "panorama" : "capture");
+    if (l->kind == TAKE_PANORAMA)
+        json_set_int(o, "n_stops", l->n_stops);
+    put(o, "panorama_take", l->panorama_take);
     json_set_int(o, "n_expected", n_expected);
     json_set_int(o, "n_delivered", n_paid);
     json_set_int(o, "n_frames", n_frames);
@@ -184,10 +225,67 @@ struct json *describe_take(const struct ledger *l, bool with_cameras)
         json_set_number(o, "jitter_ms", 1e-6 * (double)l->jitter_ns);
     json_set(o, "missing", missing);
     json_set(o, "left_out", left_out);
+    if (l->processing)
+        json_set(o, "processing", describe_processing(l));
     if (with_cameras)
         json_set(o, "cameras", list);
     else
         json_free(list);
+    return o;
+}
+
+struct json *describe_plan(const struct ledger *l, const struct config *config)
+{
+    const struct panorama_config *p = &config->panorama;
+    struct json *o = json_new_object(), *stops = json_new_array();
+    json_set_string(o, "take", l->id);
+    json_set_string(o, "state", take_state_name(l->state));
+    put(o, "reason", l->reason);
+    json_set(o, "lens", lens_json(&p->lens));
+    json_set_number(o, "nodal_offset_m", p->nodal_offset_m);
+    json_set_number(o, "neutral_density_ev", p->neutral_density_ev);
+    for (int i = 0; i < l->n_stops; i++) {
+        struct json *stop = json_new_object(), *frames = json_new_array();
+        const char *note = "";
+        char name[16];
+        snprintf(name, sizeof(name), "%02d", i);
+        json_set_string(stop, "name", name);
+        json_set_number(stop, "yaw_deg", l->stop[i].yaw_deg);
+        json_set_number(stop, "pitch_deg", l->stop[i].pitch_deg);
+        for (int k = 0; k < l->n_cameras; k++) {
+            const struct ledger_camera *c = &l->camera[k];
+            const struct ledger_exposure *x = &c->exposure;
+            if (x->stop != i || x->object < 0 || x->rejected || c->debt != DEBT_PAID)
+                continue;
+            struct json *frame = json_new_object();
+            json_set_string(frame, "file", c->object[x->object].file + strlen("panorama/"));
+            json_set_number(frame, "exposure_s", x->facts.light.exposure_s);
+            json_append(frames, frame);
+            note = c->note[0] ? c->note : note;
+        }
+        put(stop, "note", note);
+        json_set(stop, "frames", frames);
+        json_append(stops, stop);
+    }
+    json_set(o, "stops", stops);
+    return o;
+}
+
+struct json *describe_progress(const struct ledger *l, const struct rig_progress *p)
+{
+    static const char *const steps[] = { "turn", "expose", "frame", "stop_done" };
+    struct json *o = json_new_object();
+    json_set_string(o, "take", l->id);
+    json_set_string(o, "step", steps[p->step]);
+    json_set_int(o, "stop", p->stop + 1);
+    json_set_int(o, "n_stops", p->n_stops);
+    json_set_number(o, "yaw_deg", p->yaw_deg);
+    json_set_number(o, "pitch_deg", p->pitch_deg);
+    if (p->step == RIG_STEP_EXPOSE || p->step == RIG_STEP_FRAME) {
+        json_set_int(o, "frame", p->bracket + 1);
+        json_set_string(o, "exposure", p->label);
+    }
+    put(o, "text", p->text);
     return o;
 }
 

@@ -7,6 +7,8 @@ struct json *describe_status(const struct rig *rig, const struct config *config,
 struct json *describe_findings(const struct rig *rig, const struct config *config);
 struct json *describe_lag(const struct rig *rig, const struct config *config);
 struct json *describe_take(const struct ledger *l, bool with_cameras);
+struct json *describe_plan(const struct ledger *l, const struct config *config); // of a panorama take: panorama_plan.h's panorama.json
+struct json *describe_progress(const struct ledger *l, const struct rig_progress *p);
 
 // Takes in takes_dir, oldest first. NULL (logged) if the folder cannot be listed.
 struct json *describe_takes(const char *takes_dir);
