@@ -200,10 +200,12 @@ static void limit_memory(int width, int height)
 {
 #if !defined(__SANITIZE_ADDRESS__) // which maps terabytes
     enum { SLACK_BYTES = 64 << 20 };
+    const rlim_t enough = (rlim_t)4 << 30; // for 300 megapixels; a header may lie
     long pages = 0;
     FILE *f = fopen("/proc/self/statm", "re");
     if (f && fscanf(f, "%ld", &pages) == 1) {
-        const rlim_t most = (rlim_t)pages * (rlim_t)sysconf(_SC_PAGESIZE) + 2 * (rlim_t)width * (rlim_t)height * 6 + SLACK_BYTES;
+        rlim_t most = (rlim_t)pages * (rlim_t)sysconf(_SC_PAGESIZE) + 2 * (rlim_t)width * (rlim_t)height * 6 + SLACK_BYTES;
+        most = most < enough ? most : enough;
         setrlimit(RLIMIT_AS, &(struct rlimit){ most, most });
     }
     if (f)
