@@ -18,11 +18,18 @@ _rigctl() {
         esac
     done
     case $command in
-    '') mapfile -t COMPREPLY < <(compgen -W "status doctor preflight capture cancel takes report preview resume export calibrate identify reinstate metrics events \
+    '') mapfile -t COMPREPLY < <(compgen -W "status doctor preflight capture cancel takes report process preview resume export calibrate identify reinstate metrics events \
         panorama develop --socket --json --help --version" -- "$cur") ;;
     calibrate) mapfile -t COMPREPLY < <(compgen -W "lag colour --shots --patch --chart --places --reference --check -o" -- "$cur") ;;
     identify | reinstate) mapfile -t COMPREPLY < <(compgen -W "$(_rigctl_ask status name)" -- "$cur") ;;
-    preview | report | resume | export) mapfile -t COMPREPLY < <(compgen -W "$(_rigctl_ask takes id)" -- "$cur") ;;
+    process)
+        if [[ $before == --again ]]; then
+            mapfile -t COMPREPLY < <(compgen -W "sheet develop panorama reconstruct preview focus standard final" -- "$cur")
+        else
+            mapfile -t COMPREPLY < <(compgen -W "$(_rigctl_ask takes id) --again --cancel --watch" -- "$cur")
+        fi ;;
+    report) mapfile -t COMPREPLY < <(compgen -W "$(_rigctl_ask takes id) --open" -- "$cur") ;;
+    preview | resume | export) mapfile -t COMPREPLY < <(compgen -W "$(_rigctl_ask takes id)" -- "$cur") ;;
     status) mapfile -t COMPREPLY < <(compgen -W "--watch" -- "$cur") ;;
     capture) mapfile -t COMPREPLY < <(compgen -W "--name --without-missing" -- "$cur") ;;
     develop) [[ $cur == -* ]] && mapfile -t COMPREPLY < <(compgen -W "-o --tiff --half --bilinear --ahd --flat --colour --reference-exposure --exposure --saturation \
