@@ -610,7 +610,7 @@ static void cancelled_is_cancelled_and_can_be_begun_again(void **state)
 {
     (void)state;
     new_world(2, 2);
-    struct study *t = new_take("20260101_a", 8), *other = new_take("20260101_b", 1);
+    struct study *t = new_take("20260101_a", 8), *other = new_take("20251231_b", 1);
     add(t);
     add(other);
     run(w.now_ns + 5 * S / 2);
