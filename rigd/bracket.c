@@ -11,6 +11,8 @@
 #include <string.h>
 
 static const double clip_level = .98; // of saturation: sensors do not clip at one DN exactly
+static const double bloom_level = 1.8;
+enum { SATURATED = 1, OVERFLOWING = 2 }; // marks
 
 struct block { // of a frame against its prediction m: sums over sites that are good in both
     int n;
@@ -148,7 +150,8 @@ static enum bracket_fault check_facts(const struct raw_frame *a, const struct ra
 
 struct rows {
     const struct bracket *b;
-    const struct raw_frame *f;
+    const struct raw_frame *f, *shorter; // shorter: or NULL
+    double ratio; // of f's exposure to it
     int next; // row whose saturation is marked next
 };
 
@@ -161,7 +164,11 @@ static void mark_saturated(struct rows *r, int y)
         uint8_t *mark = b->saturated + (size_t)(r->next % n) * (size_t)width;
         for (int x = 0; x < width; x++) {
             const double black = b->like.black[r->next & 1][x & 1];
-            mark[x] = site[x] >= black + clip_level * (b->saturation - black);
+            mark[x] = 0;
+            if (site[x] < black + clip_level * (b->saturation - black))
+                continue;
+            const double beyond = r->shorter ? (r->shorter->site[(size_t)r->next * (size_t)width + (size_t)x] - black) * r->ratio : INFINITY;
+            mark[x] = beyond >= bloom_level * (b->saturation - black) ? OVERFLOWING : SATURATED;
         }
     }
 }
@@ -179,10 +186,10 @@ static void judge_row(struct rows *r, int y)
     }
     for (int v = y - reach < 0 ? 0 : y - reach; v <= y + reach && v < r->f->height; v++) {
         const uint8_t *mark = b->saturated + (size_t)(v % n) * (size_t)width;
-        if (!memchr(mark, 1, (size_t)width))
+        if (!memchr(mark, OVERFLOWING, (size_t)width))
             continue;
         for (int x = 0; x < width; x++)
-            for (int u = x - reach < 0 ? 0 : x - reach; mark[x] && u <= x + reach && u < width; u++)
+            for (int u = x - reach < 0 ? 0 : x - reach; mark[x] == OVERFLOWING && u <= x + reach && u < width; u++)
                 if (b->row_quality[u] == BRACKET_GOOD)
                     b->row_quality[u] = BRACKET_POOR;
     }
@@ -199,10 +206,10 @@ static double floor_radiance(const struct bracket *b, double longest)
     return b->noise.read_noise_e / (b->noise.electrons_at_white * longest);
 }
 
-static void compare_blocks(struct bracket *b, const struct raw_frame *f, double h)
+static void compare_blocks(struct bracket *b, struct rows rows, double h)
 {
     const double w = b->noise.electrons_at_white, read = b->noise.read_noise_e / w, least = floor_radiance(b, b->longest);
-    struct rows rows = { .b = b, .f = f };
+    const struct raw_frame *f = rows.f;
     memset(b->block, 0, (size_t)b->blocks_x * (size_t)b->blocks_y * sizeof(*b->block));
     for (int y = 0; y < f->height; y++) {
         const size_t row = (size_t)y * (size_t)f->width;
@@ -284,7 +291,7 @@ static void find_patch(const struct bracket *b, uint8_t *mark, int *stack, doubl
     }
 }
 
-static int compare_frame(struct bracket *b, const struct raw_frame *f, double h, struct bracket_frame_report *r)
+static int compare_frame(struct bracket *b, struct rows rows, double h, struct bracket_frame_report *r)
 {
     const int n_blocks = b->blocks_x * b->blocks_y;
     double *v = malloc((size_t)n_blocks * sizeof(*v));
@@ -294,7 +301,7 @@ static int compare_frame(struct bracket *b, const struct raw_frame *f, double h,
     if (!v || !stack || !mark)
         goto out;
     err = 0;
-    compare_blocks(b, f, h);
+    compare_blocks(b, rows, h);
     for (int i = 0; i < n_blocks; i++)
         if (is_compared(b->block + i))
             v[n++] = b->block[i].y / b->block[i].m;
@@ -305,7 +312,11 @@ static int compare_frame(struct bracket *b, const struct raw_frame *f, double h,
     for (int i = 0; i < n; i++)
         v[i] = fabs(v[i] - r->gain);
     r->gain_error = 1.2533 * 1.4826 * median(v, n) / sqrt(n);
-    double chi2 = 0, count = 0;
+    double chi2 = 0, count = 0, sum_m = 0, sum_v = 0;
+    for (int i = 0; i < n_blocks; i++)
+        if (is_compared(b->block + i))
+            sum_m += b->block[i].m, sum_v += b->block[i].v;
+    r->gain_error = fmax(r->gain_error, 1.2533 * sqrt(sum_v) / sum_m); // few blocks may agree by chance
     n = 0;
     for (int i = 0; i < n_blocks; i++)
         if (is_compared(b->block + i)) {
@@ -328,10 +339,10 @@ out:
 
 // ---- taking in ------------------------------------------------------------------------------------------------------------------
 
-static void take_in(struct bracket *b, const struct raw_frame *f, double h, struct bracket_frame_report *r)
+static void take_in(struct bracket *b, struct rows rows, double h, struct bracket_frame_report *r)
 {
     const double w = b->noise.electrons_at_white, s = b->noise.read_noise_e;
-    struct rows rows = { .b = b, .f = f };
+    const struct raw_frame *f = rows.f;
     for (int y = 0; y < f->height; y++) {
         const size_t row = (size_t)y * (size_t)f->width;
         judge_row(&rows, y);
@@ -360,12 +371,12 @@ static void take_in(struct bracket *b, const struct raw_frame *f, double h, stru
     }
 }
 
-int bracket_add(struct bracket *b, const struct raw_frame *f, double exposure_s, struct bracket_frame_report *r)
+int bracket_add(struct bracket *b, const struct raw_frame *f, const struct raw_frame *next, struct bracket_frame_report *r)
 {
-    struct raw_frame as = *f;
-    if (exposure_s > 0)
-        as.exposure_s = exposure_s;
-    const double h = bracket_exposure(&as);
+    const double h = bracket_exposure(f), h_next = next ? bracket_exposure(next) : 0;
+    struct rows rows = { .b = b, .f = f };
+    if (h_next > 0 && h_next < h && check_facts(&b->like, next, h_next) == BRACKET_FITS)
+        rows.shorter = next, rows.ratio = h / h_next;
     *r = (struct bracket_frame_report){ .exposure = h, .gain = 1, .gain_error = INFINITY, .change = 1, .chi2 = 1 };
     r->fault = check_facts(&b->like, f, h);
     if (r->fault != BRACKET_FITS)
@@ -382,7 +393,7 @@ int bracket_add(struct bracket *b, const struct raw_frame *f, double exposure_s,
     for (int i = 0; i < b->n_taken; i++)
         r->is_repeat = r->is_repeat || fabs(h / b->taken[i] - 1) < .01;
     if (b->n_taken) {
-        const int err = compare_frame(b, f, h, r);
+        const int err = compare_frame(b, rows, h, r);
         if (err)
             return err;
         if (r->n_blocks >= 4 && fabs(r->gain - 1) > b->gain_refused) {
@@ -392,7 +403,7 @@ int bracket_add(struct bracket *b, const struct raw_frame *f, double exposure_s,
     }
     b->longest = fmax(b->longest, h);
     b->taken[b->n_taken++] = h;
-    take_in(b, f, h, r);
+    take_in(b, rows, h, r);
     return 0;
 }
 

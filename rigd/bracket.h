@@ -8,7 +8,8 @@
 // with it, frames count by u_i = e_i / (e_i + s^2), e_i = the electrons expected of it (from the frames before it): X = sum(u y) /
 // sum(u h), var X = X / (w sum(u h)). That is the Poisson bound where e_i >> s^2 and the bound with read noise where not.
 //
-// A site of a frame is *good*: at most `usable` of saturation, and no site within bloom_px of it saturated; *poor*: not saturated;
+// A site of a frame is *good*: at most `usable` of saturation, and no site within bloom_px of it saturated by more than 1.8 times (by any,
+// where the next shorter frame cannot tell: green saturates before red and blue, and only what overflows blooms); *poor*: not saturated;
 // *clipped*. Poor ones count only where there is no good one. Clipped in all frames: the radiance is a lower bound, y / h of the shortest.
 #pragma once
 #include "rigd/develop.h"
@@ -105,9 +106,10 @@ struct bracket_frame_report {
 struct bracket;
 // first: whose size, filters, camera, levels, ISO and aperture the others must have; pixels are not looked at. 0, -ENOMEM, -EINVAL.
 int bracket_new(struct bracket **out, const struct raw_frame *first, const struct bracket_options *options);
-// Longest first (comparisons need the better frame first; the estimate does not depend on it but for rounding and weights). exposure_s:
-// the true time where it is known better, or 0: f's own. 0 or -ENOMEM; the verdict is in *report.
-int bracket_add(struct bracket *b, const struct raw_frame *f, double exposure_s, struct bracket_frame_report *report);
+// Longest first (comparisons need the better frame first; the estimate does not depend on it but for rounding and weights). exposure_s may be
+// corrected by the caller. next: the next shorter frame, or NULL: only how far a site of f is beyond saturation is looked up in it. 0 or
+// -ENOMEM; the verdict is in *report.
+int bracket_add(struct bracket *b, const struct raw_frame *f, const struct raw_frame *next, struct bracket_frame_report *report);
 // Ends b, whatever comes of it. 0; -ENODATA: no frame was taken in.
 int bracket_finish(struct merged *out, struct bracket *b, int64_t *n_clipped, int64_t *n_defects);
 void bracket_free(struct bracket *b); // NULL allowed

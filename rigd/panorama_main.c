@@ -155,10 +155,12 @@ static int measure_noise(struct job *j, const struct panorama_stop *stop, const 
     return 0;
 }
 
-// Merge in order, beginning with `first` and taking those before it last. *b: NULL if no frame could be read.
+// Merge in order, beginning with `first` and taking those before it last. *b: NULL if no frame could be read. A frame waits for the next.
 static int merge_from(struct job *j, struct bracket **b, const struct panorama_stop *stop, struct shot *shot, int n, int first, struct raw_frame *facts)
 {
     const struct bracket_options options = { .noise = j->noise };
+    struct raw_frame waiting = { 0 };
+    struct shot *whose = NULL;
     int err = 0;
     *b = NULL;
     for (int k = 0; !err && k < n; k++) {
@@ -166,6 +168,7 @@ static int merge_from(struct job *j, struct bracket **b, const struct panorama_s
         struct raw_frame f;
         char why[160] = "";
         err = raw_read(&f, s->frame->file, why, sizeof(why));
+        progress_add(1);
         if (err && err != -ENOMEM) {
             find(j, DOUBT, "unreadable_frame", stop->name, s->frame->file, "left out: %s", why[0] ? why : strerror(-err));
             s->report = (struct bracket_frame_report){ .fault = BRACKET_NO_TIME };
@@ -173,16 +176,20 @@ static int merge_from(struct job *j, struct bracket **b, const struct panorama_s
             continue;
         }
         f.exposure_s = s->exposure_s;
+        if (!err && whose)
+            err = bracket_add(*b, &waiting, &f, &whose->report);
         if (!err && !*b) {
             *facts = f;
             facts->site = NULL;
             err = bracket_new(b, &f, &options);
         }
-        if (!err)
-            err = bracket_add(*b, &f, s->exposure_s, &s->report);
-        raw_free(&f);
-        progress_add(1);
+        raw_free(&waiting);
+        waiting = f;
+        whose = s;
     }
+    if (!err && whose)
+        err = bracket_add(*b, &waiting, NULL, &whose->report);
+    raw_free(&waiting);
     return err;
 }
 
@@ -233,7 +240,7 @@ static void judge_frame(struct job *j, const struct panorama_stop *stop, const d
     if (r->plateau_dn)
         find(j, NOTE, "plateau", stop->name, file, "the sensor clips at %d DN, below what the file calls white: the lower one is taken", r->plateau_dn);
     const double off = fabs(r->gain - 1);
-    if (off > .01 && off > 5 * r->gain_error)
+    if (r->n_blocks >= 2 && off > .01 && off > 5 * r->gain_error)
         find(j, off > .03 ? DOUBT : NOTE, "flicker", stop->name, file, "%.1f %% %s than the others and its exposure say: a flickering lamp, or an inexact shutter",
              100 * off, r->gain > 1 ? "brighter" : "darker");
     if (r->is_repeat && r->n_blocks >= 4 && r->chi2 > 1.25)
@@ -275,9 +282,10 @@ static struct json *describe_frame(const struct shot *s)
 static void judge_steps(struct job *j, const struct panorama_stop *stop, const struct shot *shot, int n)
 {
     const struct shot *longer = NULL;
-    for (int i = 0; i < n; i++) {
+    for (int i = 0; i < n; i++)
         if (shot[i].report.fault != BRACKET_FITS)
-            continue;
+            return; // which is named already
+    for (int i = 0; i < n; i++) {
         if (longer && log2(longer->h / shot[i].h) > usual_gap_ev)
             find(j, DOUBT, "missing_frame", stop->name, shot[i].frame->file, "%.1f EV below the next longer frame: is one missing between them?",
                  log2(longer->h / shot[i].h));
@@ -289,7 +297,7 @@ static void judge_seam(struct job *j, const struct panorama_stop *stop, const st
 {
     if (r->n_cells < 20)
         return;
-    if (r->seam_ev > .12 || fabs(log2(r->seam_gain)) > .15)
+    if (r->seam_ev > .08 || fabs(log2(r->seam_gain)) > .15)
         find(j, DOUBT, "stop_does_not_fit", stop->name, NULL, "differs from the stops before it by %.2f EV (brightness %+.1f %%) where both see: "
              "stops in another order, other head angles than the plan's, or another lens", r->seam_ev, 100 * (r->seam_gain - 1));
     else if (fabs(r->seam_gain - 1) > .03)
@@ -346,7 +354,8 @@ static int do_stop(struct job *j, struct stitch *stitch, const struct panorama_s
         json_append(frames, describe_frame(shot + i));
     }
     json_set(to, "frames", frames);
-    judge_steps(j, stop, shot, n);
+    if (n == stop->n_frames)
+        judge_steps(j, stop, shot, n);
     if (!b || !n_used || !is_same_camera(j, stop, &facts)) {
         if (!b || !n_used)
             find(j, DOUBT, "missing_stop", stop->name, NULL, "none of its %d frames can be used: what it would have seen stays uncovered", stop->n_frames);

@@ -72,7 +72,8 @@ void rig_give_up(struct rig *r, int i, const char *why)
         c->debt = DEBT_MISSED;
         snprintf(c->note, sizeof(c->note), "%.199s", why);
         rig_changed(r);
-        rig_say(r, r->purpose == FOR_PANORAMA ? RIG_WARNING : RIG_ERROR, i, "its frame was not fetched: %s", why);
+        if (r->purpose != FOR_PANORAMA || !r->panorama.looking)
+            rig_say(r, r->purpose == FOR_PANORAMA ? RIG_WARNING : RIG_ERROR, i, "its frame was not fetched: %s", why);
     } else if (r->phase == PHASE_DELETE && step == STEP_DELETE) {
         rig_say(r, RIG_WARNING, i, "frames stay on its card, they were not deleted: %s", why);
     }

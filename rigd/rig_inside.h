@@ -111,6 +111,7 @@ struct rig {
         int entry;                    // the ledger's exposure under way
         int n_tries;                  // at it
         int stop_at, n_turns;         // where the head stands, -1: not known | how often it was asked to go to the present stop
+        int64_t turn_limit_ns;        // TURN: a head that is busy is waited for so long
         bool turn_again;              // TURN: the head failed, and is asked again when the phase is due
         int n_old, looked;            // resumed: that many entries of before, up to this one looked for on the card
         bool looking;                 // COLLECT without an exposure: on the card of an earlier life

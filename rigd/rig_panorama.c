@@ -96,6 +96,7 @@ static void begin_turn(struct rig *r, int64_t now)
         return;
     case HEAD_BOARD:
         r->phase = PHASE_TURN;
+        r->panorama.turn_limit_ns = now + TURN_MS * MS;
         ask_head(r, now);
         return;
     case HEAD_MANUAL:
@@ -120,6 +121,9 @@ void rig_head_arrived(struct rig *r, int64_t now, int err)
     const struct ledger_exposure *e = &rig_entry(r, 0)->exposure;
     if (!err) {
         begin_still(r, now);
+    } else if (err == -EBUSY && now < r->panorama.turn_limit_ns) { // it still obeys somebody else: a daemon that died
+        r->panorama.turn_again = true;
+        r->phase_due_ns = now + TURN_AGAIN_MS * MS;
     } else if (err != -ENOTSUP && err != -EINVAL && ++r->panorama.n_turns < TURN_TRIES_MAX) {
         rig_say(r, RIG_WARNING, CONFIG_NONE, "the head did not reach yaw %g, pitch %g degrees (%s); it is asked again", e->yaw_deg, e->pitch_deg, strerror(-err));
         r->panorama.turn_again = true;

@@ -17,7 +17,7 @@
 #include <sys/un.h>
 #include <unistd.h>
 
-enum { EXIT_DONE = 0, EXIT_FAILED = 1, EXIT_USAGE = 2, LINE_MAX_BYTES = 64 << 20 };
+enum { EXIT_DONE = 0, EXIT_FAILED = 1, EXIT_USAGE = 2, LINE_MAX_BYTES = 64 << 20, OPTION_OPEN = 256, OPTION_MERGE };
 
 struct arguments {
     const char *socket_path, *name, *again, *merge, *output, *word[3];
@@ -127,6 +127,20 @@ static bool flag_of(const struct json *v, const char *path)
     return b;
 }
 
+static void print_progress(const struct json *p)
+{
+    const char *step = text_of(p, "step"), *text = text_of(p, "text");
+    const double stop = number_of(p, "stop", 0), n_stops = number_of(p, "n_stops", 0);
+    if (!strcmp(step, "turn"))
+        fprintf(stderr, "  stop %.0f of %.0f: to yaw %g, pitch %g\n", stop, n_stops, number_of(p, "yaw_deg", 0), number_of(p, "pitch_deg", 0));
+    else if (!strcmp(step, "expose"))
+        fprintf(stderr, "  stop %.0f of %.0f: exposure %.0f, %s s\n", stop, n_stops, number_of(p, "frame", 0), text_of(p, "exposure"));
+    else if (!strcmp(step, "frame"))
+        fprintf(stderr, "    %s\n", text);
+    else
+        fprintf(stderr, "  stop %.0f of %.0f is done: %s\n", stop, n_stops, text);
+}
+
 // One line when a step changes, another when it is done; how far it has come goes over the line before on a terminal.
 static void print_step_event(const struct json *body)
 {
@@ -143,20 +157,6 @@ static void print_step_event(const struct json *body)
     if (strcmp(line, last))
         fprintf(stderr, "%s\n", line);
     snprintf(last, sizeof(last), "%s", line);
-}
-
-static void print_progress(const struct json *p)
-{
-    const char *step = text_of(p, "step"), *text = text_of(p, "text");
-    const double stop = number_of(p, "stop", 0), n_stops = number_of(p, "n_stops", 0);
-    if (!strcmp(step, "turn"))
-        fprintf(stderr, "  stop %.0f of %.0f: to yaw %g, pitch %g\n", stop, n_stops, number_of(p, "yaw_deg", 0), number_of(p, "pitch_deg", 0));
-    else if (!strcmp(step, "expose"))
-        fprintf(stderr, "  stop %.0f of %.0f: exposure %.0f, %s s\n", stop, n_stops, number_of(p, "frame", 0), text_of(p, "exposure"));
-    else if (!strcmp(step, "frame"))
-        fprintf(stderr, "    %s\n", text);
-    else
-        fprintf(stderr, "  stop %.0f of %.0f is done: %s\n", stop, n_stops, text);
 }
 
 static void print_event(const struct json *message)
@@ -318,6 +318,10 @@ static void print_status(const struct json *s)
         printf("last: %s\n", text_of(s, "outcome"));
     if (text_of(s, "prompt")[0])
         printf("==> %s\n", text_of(s, "prompt"));
+    if (text_of(s, "refusal")[0])
+        printf("a take would be refused: %s\n", text_of(s, "refusal"));
+    if (text_of(s, "page")[0])
+        printf("page: %s\n", text_of(s, "page"));
     printf("%-10s %-12s %-11s %-12s %-20s %5s %6s %8s  %s\n", "camera", "condition", "doing", "serial", "model", "batt", "free", "lag ms", "note");
     for (int i = 0; i < json_length(s, "cameras"); i++) {
         const struct json *c = element(s, "cameras", i);
@@ -768,9 +772,9 @@ static const struct argp_option option_list[] = {
     { "watch", 'w', NULL, 0, "status: live; process: until it is settled", 0 },
     { "again", 'a', "STEP", 0, "process: make it anew: sheet, develop, panorama, reconstruct, preview, focus, standard, final", 0 },
     { "cancel", 'c', NULL, 0, "process: stop", 0 },
-    { "open", 'O', NULL, 0, "report: show the newest page", 0 },
+    { "open", OPTION_OPEN, NULL, 0, "report: show the newest page", 0 },
     { "name", 'n', "NAME", 0, "capture, panorama: of the take", 0 },
-    { "merge", 'M', "PLAN|TAKE", 0, "panorama: make FILE of one that was shot before", 0 },
+    { "merge", OPTION_MERGE, "PLAN|TAKE", 0, "panorama: make FILE of one that was shot before", 0 },
     { "output", 'o', "FILE", 0, "panorama --merge: the EXR", 0 },
     { "without-missing", 'm', NULL, 0, "capture: leave cameras out that are not fit", 0 },
     { "shots", 'k', "N", 0, "calibrate: how many (rigd.conf's)", 0 },
@@ -799,14 +803,14 @@ static error_t parse(int key, char *arg, struct argp_state *state)
     case 'c':
         a->cancel = true;
         return 0;
-    case 'O':
-        a->open = true;
-        return 0;
-    case 'M':
+    case OPTION_MERGE:
         a->merge = arg;
         return 0;
     case 'o':
         a->output = arg;
+        return 0;
+    case OPTION_OPEN:
+        a->open = true;
         return 0;
     case 'm':
         a->without_missing = true;

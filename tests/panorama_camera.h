@@ -178,7 +178,7 @@ static inline int sim_studio(struct image *out, int width)
             float *p = out->data + ((size_t)y * (size_t)width + (size_t)x) * 3;
             double d[3];
             panorama_direction(width, out->height, x + .5, y + .5, d);
-            const double base = .05 + .04 * d[1] + .02 * sin(3 * d[0]) * cos(2 * d[2]);
+            const double base = .05 + .03 * d[1] + .012 * sin(3 * d[0]) * cos(2 * d[2]);
             p[0] = (float)(base * (d[0] > .5 ? 1.6 : 1)), p[1] = (float)base, p[2] = (float)(base * (d[2] < -.5 ? 1.5 : 1));
             if (fabs(d[0] / d[2] + .3) < .25 && fabs(d[1] / d[2] - .6) < .2 && d[2] > 0)
                 p[0] = 180, p[1] = 200, p[2] = 210; // a soft box

@@ -39,17 +39,18 @@ static void merge(struct merged *out, const float *scene, const struct sim_camer
     const struct bracket_options options = options_of(c);
     int64_t ignored[2];
     camera.seed = seed;
+    struct raw_frame f[8];
+    for (int i = 0; i < n_frames; i++)
+        assert_int_equal(sim_expose(f + i, scene, &camera, whole * pow(.25, i), 1, (uint64_t)i), 0);
+    assert_int_equal(bracket_new(&b, f, &options), 0);
     for (int i = 0; i < n_frames; i++) {
-        struct raw_frame f;
         struct bracket_frame_report r;
-        assert_int_equal(sim_expose(&f, scene, &camera, whole * pow(.25, i), 1, (uint64_t)i), 0);
-        if (!b)
-            assert_int_equal(bracket_new(&b, &f, &options), 0);
-        assert_int_equal(bracket_add(b, &f, 0, &r), 0);
+        assert_int_equal(bracket_add(b, f + i, i + 1 < n_frames ? f + i + 1 : NULL, &r), 0);
         if (reports)
             reports[i] = r;
-        free(f.site);
     }
+    for (int i = 0; i < n_frames; i++)
+        free(f[i].site);
     assert_int_equal(bracket_finish(out, b, n_clipped ? n_clipped : ignored, n_defects ? n_defects : ignored + 1), 0);
 }
 
@@ -134,7 +135,7 @@ static void without_read_noise_it_is_the_sum_of_signals_over_the_sum_of_exposure
         assert_int_equal(sim_expose(f + i, scene, &c, pow(.25, i), 1, (uint64_t)i), 0);
     assert_int_equal(bracket_new(&b, f, &options), 0);
     for (int i = 0; i < 3; i++)
-        assert_int_equal(bracket_add(b, f + i, 0, &r), 0);
+        assert_int_equal(bracket_add(b, f + i, NULL, &r), 0);
     assert_int_equal(bracket_finish(&m, b, n, n + 1), 0);
     for (int i = 0; i < W * H; i++) {
         const double y = f[0].site[i] + f[1].site[i] + f[2].site[i] - 3 * c.black;
@@ -196,13 +197,35 @@ static void light_that_bloomed_over_does_not_count_while_a_clean_frame_is_there(
         f[i].site[64 * W + 97] = (uint16_t)(c.black + 9000);
     assert_int_equal(bracket_new(&b, f, &options), 0);
     for (int i = 0; i < 4; i++)
-        assert_int_equal(bracket_add(b, f + i, 0, &r), 0);
+        assert_int_equal(bracket_add(b, f + i, i < 3 ? f + i + 1 : NULL, &r), 0);
     assert_int_equal(bracket_finish(&m, b, n, n + 1), 0);
     assert_int_equal(m.quality[64 * W + 97], BRACKET_GOOD);
     assert_true(fabs((double)m.radiance[64 * W + 97] - .1) < 5 * sqrt((double)m.variance[64 * W + 97]));
     assert_true(fabs((double)m.radiance[64 * W + 96] / 20 - 1) < .1);
     for (int i = 0; i < 4; i++)
         free(f[i].site);
+    merged_free(&m);
+    free(scene);
+}
+
+// Green saturates first: red and blue beside it still count, or coloured sensors would lose their best frame over half a stop.
+static void a_site_beside_one_that_is_just_saturated_counts(void **state)
+{
+    (void)state;
+    const struct sim_camera c = camera_of(2);
+    float *scene = levels(.7, .7);
+    for (int i = 0; i < W * H; i++)
+        if (((i / W) & 1) + (i % W & 1) == 1)
+            scene[i] = 1.4f;
+    struct merged m;
+    merge(&m, scene, &c, 2, 5, NULL, NULL, NULL);
+    double said = 0;
+    for (int i = 0; i < W * H; i++) {
+        assert_int_equal(m.quality[i], BRACKET_GOOD);
+        if (((i / W) & 1) + (i % W & 1) != 1)
+            said += (double)m.variance[i] / (W * H / 2);
+    }
+    assert_float_equal(said * c.electrons_at_white * 1.25 / .7, 1, .01); // both frames: the Poisson bound
     merged_free(&m);
     free(scene);
 }
@@ -224,7 +247,7 @@ static void a_stuck_site_is_no_light(void **state)
         f.site[33 * W + 77] = 16383;
         if (!b)
             assert_int_equal(bracket_new(&b, &f, &options), 0);
-        assert_int_equal(bracket_add(b, &f, 0, &r), 0);
+        assert_int_equal(bracket_add(b, &f, NULL, &r), 0);
         assert_int_equal(bracket_measure(&s, &f, NULL), 0);
         assert_true(s.n_over[0] + s.n_over[1] + s.n_over[2] == 0);
         free(f.site);
@@ -253,7 +276,7 @@ static void frames_that_do_not_belong_are_named_and_left_out(void **state)
     assert_int_equal(sim_expose(&first, scene, &c, 1, 1, 0), 0);
     assert_int_equal(sim_expose(&f, scene, &c, .25, 1, 1), 0);
     assert_int_equal(bracket_new(&b, &first, &options), 0);
-    assert_int_equal(bracket_add(b, &first, 0, &r), 0);
+    assert_int_equal(bracket_add(b, &first, NULL, &r), 0);
     assert_int_equal(r.fault, BRACKET_FITS);
     struct raw_frame bad[8];
     const enum bracket_fault expected[8] = { BRACKET_OTHER_CAMERA, BRACKET_OTHER_CAMERA, BRACKET_OTHER_ISO, BRACKET_OTHER_APERTURE, BRACKET_OTHER_LEVELS,
@@ -269,24 +292,25 @@ static void frames_that_do_not_belong_are_named_and_left_out(void **state)
     bad[6].cfa[0][0] = 2, bad[6].cfa[1][1] = 0;
     bad[7].exposure_s = 0;
     for (int i = 0; i < 8; i++) {
-        assert_int_equal(bracket_add(b, bad + i, 0, &r), 0);
+        assert_int_equal(bracket_add(b, bad + i, NULL, &r), 0);
         assert_int_equal(r.fault, expected[i]);
     }
     // The file says nothing, the light does: stopped down by one, with an old lens that reports no aperture.
     free(f.site);
     assert_int_equal(sim_expose(&f, scene, &c, .25, .5, 2), 0);
-    assert_int_equal(bracket_add(b, &f, 0, &r), 0);
+    assert_int_equal(bracket_add(b, &f, NULL, &r), 0);
     assert_int_equal(r.fault, BRACKET_OTHER_BRIGHTNESS);
     assert_float_equal(r.gain, .5, .01);
     // Exchanged: a frame of 1/16 s that is said to be of 1/4 s.
     free(f.site);
     assert_int_equal(sim_expose(&f, scene, &c, 1. / 16, 1, 3), 0);
-    assert_int_equal(bracket_add(b, &f, .25, &r), 0);
+    f.exposure_s = .25;
+    assert_int_equal(bracket_add(b, &f, NULL, &r), 0);
     assert_int_equal(r.fault, BRACKET_OTHER_BRIGHTNESS);
     assert_float_equal(r.gain, .25, .01);
     free(f.site);
     assert_int_equal(sim_expose(&f, scene, &c, .25, 1, 4), 0);
-    assert_int_equal(bracket_add(b, &f, 0, &r), 0);
+    assert_int_equal(bracket_add(b, &f, NULL, &r), 0);
     assert_int_equal(r.fault, BRACKET_FITS);
     assert_int_equal(bracket_finish(&m, b, n, n + 1), 0);
     double sum = 0;
@@ -320,10 +344,11 @@ static void flicker_shows_as_gain_and_movement_as_a_patch(void **state)
     assert_int_equal(sim_expose(f + 4, scene, &c, 1. / 64, .98, 4), 0); // a repeat, 2 % darker
     assert_int_equal(bracket_new(&b, f, &options), 0);
     for (int i = 0; i < 5; i++) {
-        assert_int_equal(bracket_add(b, f + i, 0, r + i), 0);
+        assert_int_equal(bracket_add(b, f + i, i < 4 ? f + i + 1 : NULL, r + i), 0);
         assert_int_equal(r[i].fault, BRACKET_FITS);
-        free(f[i].site);
     }
+    for (int i = 0; i < 5; i++)
+        free(f[i].site);
     assert_int_equal(bracket_finish(&m, b, n, n + 1), 0);
     assert_true(isinf(r[0].gain_error) && r[0].n_blocks == 0);
     assert_float_equal(r[1].gain, 1.02, 1e-3);
@@ -397,7 +422,7 @@ static void a_sensor_that_clips_below_its_white_level_is_found_out(void **state)
     assert_int_equal(bracket_measure(&s, &f, NULL), 0);
     assert_int_equal(s.plateau_dn, 15000);
     assert_int_equal(bracket_new(&b, &f, &options), 0);
-    assert_int_equal(bracket_add(b, &f, 0, &r), 0);
+    assert_int_equal(bracket_add(b, &f, NULL, &r), 0);
     assert_int_equal(r.plateau_dn, 15000);
     assert_int_equal(bracket_finish(&m, b, n, n + 1), 0);
     for (int x = 0; x < W; x++)
@@ -506,6 +531,7 @@ int main(void)
         cmocka_unit_test(without_read_noise_it_is_the_sum_of_signals_over_the_sum_of_exposures),
         cmocka_unit_test(a_light_that_clips_in_every_frame_is_marked_with_a_lower_bound),
         cmocka_unit_test(light_that_bloomed_over_does_not_count_while_a_clean_frame_is_there),
+        cmocka_unit_test(a_site_beside_one_that_is_just_saturated_counts),
         cmocka_unit_test(a_stuck_site_is_no_light),
         cmocka_unit_test(frames_that_do_not_belong_are_named_and_left_out),
         cmocka_unit_test(flicker_shows_as_gain_and_movement_as_a_patch),

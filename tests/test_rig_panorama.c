@@ -396,11 +396,14 @@ static void die_and_rise(void)
 {
     rig_free(w.rig);
     w.n_heap = 0;
-    w.shutters_held = w.head_moves = false;
+    w.shutters_held = false;
+    if (w.head_moves) // it still obeys
+        later((int64_t)(uniform(500, 4000) * MS + 30 * (double)S), W_HEAD, -1, 0);
     w.silent_until_ns = 0;
     w.n_to_open = 0;
     for (int i = 0; i < N; i++)
         w.camera[i].worker = w.camera[i].open = w.camera[i].in_flight = false;
+    w.n_head_silent = w.head_moves; // to one who is dead
     w.head_yaw_deg = 77; // somebody has moved it
     assert_int_equal(rig_create(&w.rig, &w.config), 0);
     rig_trigger_is(w.rig, w.now, w.abilities);

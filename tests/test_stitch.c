@@ -200,6 +200,8 @@ static void stops_join_without_a_seam_and_a_stop_in_the_wrong_place_shows(void *
             struct sim_camera c = fisheye(200, 92);
             c.yaw_deg = 120 * i;
             look(&m, &truth, &c, 3);
+            for (int k = 0; k < m.width * m.height; k++)
+                m.variance[k] = 1e-8f;
             if (wrong)
                 c.yaw_deg = i == 1 ? 240 : i == 2 ? 120 : 0; // the plan has the last two in another order
             add(s, &c, &m, &r);
@@ -214,7 +216,7 @@ static void stops_join_without_a_seam_and_a_stop_in_the_wrong_place_shows(void *
         assert_int_equal(stitch_finish(&out, s, identity, &whole), 0);
         if (getenv("VERBOSE"))
             fprintf(stderr, "%s: seam %.3f EV, uncovered %.4f sr\n", wrong ? "exchanged" : "in order", worst_ev, whole.uncovered_sr);
-        assert_true(wrong ? worst_ev > .15 : worst_ev < .02);
+        assert_true(wrong ? worst_ev > .1 : worst_ev < .02);
         if (!wrong) {
             assert_true(whole.uncovered_sr < .05);
             double error[128 * 64];

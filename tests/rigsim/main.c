@@ -1,6 +1,7 @@
 // tests/rigsim/main.c - rigsim's command line.
 #include "solver/take/log.h"
 #include "tests/rigsim/body.h"
+#include "tests/rigsim/probe.h"
 #include "tests/rigsim/server.h"
 
 #include <argp.h>
@@ -143,6 +144,18 @@ static error_t option(int key, char *text, struct argp_state *state)
     }
 }
 
+// The lens as keys of rigd.conf.
+static void print_panorama(const struct server_settings *s)
+{
+    struct lens l;
+    if (probe_lens(&l, s->lens, s->width_px, s->height_px))
+        return;
+    printf("[panorama]\ncamera = %s\nhead = %s\nlens = %s\nwidth_px = %d\nheight_px = %d\nfocal_px = %.6f\ncentre_px = %.6f, %.6f\n", server_camera_name(s->panorama_camera),
+           s->trigger_socket ? "board" : "manual", lens_model_name(l.model), l.width_px, l.height_px, l.focal_px, l.centre_px[0], l.centre_px[1]);
+    printf("distortion = %.9f, %.9f, %.9f, %.9f, %.9f\ncircle_px = %.6f\nmax_angle_deg = %.6f\nshading = %.9f, %.9f, %.9f\n", l.k[0], l.k[1], l.k[2], l.p[0], l.p[1], l.circle_px,
+           l.max_angle_rad * 180 / M_PI, l.v[0], l.v[1], l.v[2]);
+}
+
 // Sections of rigd.conf; personality: a file of config/cameras/.
 static void print_list(const struct server_settings *s)
 {
@@ -160,6 +173,8 @@ static void print_list(const struct server_settings *s)
         printf("\n");
         body_free(&b);
     }
+    if (s->panorama)
+        print_panorama(s);
 }
 
 int main(int argc, char **argv)

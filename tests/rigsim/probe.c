@@ -1,6 +1,5 @@
 // tests/rigsim/probe.c - see probe.h. Sites of the present view are kept: a bracket of exposures looks at the same ones.
 #include "tests/rigsim/probe.h"
-#include "rigd/lens.h"
 #include "solver/panorama.h"
 #include "solver/take/atomic_file.h"
 #include "solver/take/log.h"
@@ -209,7 +208,7 @@ void probe_row(struct probe *p, const struct scene_view *view, int y, float *sit
 // ---- life ----------------------------------------------------------------------------------------------------------------------
 
 // Its size is the sensor's.
-static int read_lens(struct lens *out, const char *lens, int width_px, int height_px)
+int probe_lens(struct lens *out, const char *lens, int width_px, int height_px)
 {
     struct json *doc = NULL;
     char *text = NULL;
@@ -238,7 +237,7 @@ int probe_open(struct probe **out, const char *panorama, const char *lens, doubl
         return -ENOMEM;
     int err = panorama_read(&p->picture, panorama);
     if (!err)
-        err = read_lens(&p->lens, lens, width_px, height_px);
+        err = probe_lens(&p->lens, lens, width_px, height_px);
     if (err)
         goto fail;
     err = -ENOMEM;
