@@ -443,13 +443,16 @@ static void start(struct processing *p, int64_t now_ns, const struct candidate *
     act(p, PROCESSING_STATE, c->take, c->step, 0);
 }
 
-// Something that has no time is between two steps, with the disk: what has time does not begin just to make room again.
-static bool better_is_coming(const struct processing *p)
+// Something better is between two steps, with the disk: c does not begin just to be in its way.
+static bool better_is_coming(const struct processing *p, const struct candidate *c)
 {
     for (int t = 0; t < p->n_takes; t++)
-        for (int s = 0; s <= STEP_PREVIEW; s++)
-            if (p->take[t]->step[s].state == PROCESSING_LOOKING || count(&p->take[t]->step[s], ITEM_ENDED) || count(&p->take[t]->step[s], ITEM_KEEPING))
+        for (int s = STEP_DEVELOP; s <= STEP_PREVIEW; s++) {
+            const struct candidate next = { p->take[t], STEP_PREVIEW, 0 };
+            const struct step *step = &p->take[t]->step[s];
+            if ((step->state == PROCESSING_LOOKING || count(step, ITEM_ENDED) || count(step, ITEM_KEEPING)) && order(&next, c) < 0)
                 return true;
+        }
     return false;
 }
 
@@ -460,7 +463,7 @@ static void schedule(struct processing *p, int64_t now_ns)
     while (best(p, &c, develop_is_full)) {
         const struct load l = measure(p);
         const struct item *i = item_of(&c);
-        if (c.step > STEP_PREVIEW && better_is_coming(p))
+        if (better_is_coming(p, &c))
             return;
         if (c.step == STEP_DEVELOP && !i->paused && l.develops > 0 &&
             (l.develops >= p->settings.n_develop || l.memory_bytes + i->what.memory_bytes > p->settings.memory_bytes)) {

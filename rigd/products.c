@@ -313,6 +313,23 @@ static bool is_there(const struct products *p, const struct note *n, const char 
     return size_of(path) == n->size_bytes;
 }
 
+// What programs that were killed had begun: hidden .part files of ours. The ledger's own, and what the rig is copying, is not touched.
+static void remove_parts(const struct products *p, const char *folder, const char *prefix)
+{
+    char dir[PATH_BYTES], path[PATH_BYTES + 300];
+    in_take(p, dir, folder);
+    DIR *d = opendir(dir);
+    for (const struct dirent *e; d && (e = readdir(d));) {
+        const size_t n = strlen(e->d_name);
+        if (strncmp(e->d_name, prefix, strlen(prefix)) || n < 6 || strcmp(e->d_name + n - 5, ".part"))
+            continue;
+        snprintf(path, sizeof(path), "%s/%s", dir, e->d_name);
+        unlink(path);
+    }
+    if (d)
+        closedir(d);
+}
+
 // ---- life ---------------------------------------------------------------------------------------------------------------------
 
 int products_open(struct products **out, const struct products_site *site, const char *id)
@@ -331,6 +348,9 @@ int products_open(struct products **out, const struct products_site *site, const
     if (err)
         goto fail;
     p->is_panorama = p->ledger.kind == TAKE_PANORAMA;
+    static const char *const parts[][2] = { { ".", ".panorama" }, { ".", ".processing.json" }, { "linear", "." }, { "sheet", "." }, { "geometry", "." }, { "geometry/cameras", "." } };
+    for (size_t i = 0; i < sizeof(parts) / sizeof(parts[0]); i++)
+        remove_parts(p, parts[i][0], parts[i][1]);
     err = read_notes(p);
     if (err)
         goto fail;

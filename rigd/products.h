@@ -20,7 +20,8 @@ struct products_site { // what is the same for all takes
     int n_threads;            // for solves
 };
 
-// Reads take.json and processing.json (broken: set aside with a warning, everything is looked at anew). 0 or -errno (logged).
+// Reads take.json and processing.json (broken: set aside with a warning, everything is looked at anew), and removes what programs that
+// were killed had begun: none may be at work on this take. 0 or -errno (logged).
 int products_open(struct products **out, const struct products_site *site, const char *id); // *site stays the caller's
 void products_close(struct products *p); // NULL allowed
 

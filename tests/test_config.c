@@ -113,6 +113,12 @@ static void each_fault_is_named_with_its_line_and_a_remedy(void **state)
         { HEAD A01 "  lens = x\n", "rigd.conf:7:", "first column" },
         { HEAD A01 "[settings]\nISO = 100\n", "rigd.conf:8:", "neutral name" },
         { HEAD A01 "[settings]\niso = 100\niso = 200\n", "rigd.conf:9:", "twice" },
+        { HEAD A01 "[develop]\nafter = yes\n", "rigd.conf:8:", "on or off" },
+        { HEAD A01 "[develop]\ndemosaic = vng\n", "rigd.conf:8:", "ahd, bilinear or half" },
+        { HEAD A01 "[develop]\nflat = frames\n", "rigd.conf:8:", "begins with /" },
+        { HEAD A01 "[solve]\nthen = soon\n", "rigd.conf:8:", "off, standard or final" },
+        { HEAD A01 "[solve]\nthreads = 1000\n", "rigd.conf:8:", "0 to 256" },
+        { HEAD A01 "[reconstruct]\nprogram = x\n", "rigd.conf:8:", "it knows command, calibrated" },
         { HEAD A01 PANORAMA, "rigd.conf:7:", "no [camera \"P01\"]" },
         { HEAD P01 PANORAMA, "rigd.conf:7:", "the only camera" },
         { HEAD A01 P01 "[panorama]\ncamera = P01\n", "rigd.conf:9:", "has no 'lens'" },
@@ -242,6 +248,26 @@ static void the_lines_of_a_board_are_outputs_and_inputs(void **state)
     config_free(&c);
 }
 
+static void naming_a_section_asks_for_what_it_does(void **state)
+{
+    (void)state;
+    struct config c;
+    assert_int_equal(parse(&c, HEAD A01), 0);
+    assert_false(c.process.develop || c.process.preview || c.process.then);
+    config_free(&c);
+    assert_int_equal(parse(&c, HEAD A01 "[develop]\n[reconstruct]\ncommand = hook --fast\n[solve]\n"), 0);
+    assert_true(c.process.develop && c.process.preview);
+    assert_int_equal(c.process.then, SOLVE_THEN_STANDARD);
+    assert_int_equal(c.process.demosaic, DEVELOP_AHD);
+    assert_string_equal(c.process.command, "hook --fast");
+    config_free(&c);
+    assert_int_equal(parse(&c, HEAD A01 "[develop]\nafter = off\ndemosaic = half\n[solve]\npreview = off\nthen = final\noptions = --lights 64\n"), 0);
+    assert_false(c.process.develop || c.process.preview);
+    assert_int_equal(c.process.then, SOLVE_THEN_FINAL);
+    assert_int_equal(c.process.demosaic, DEVELOP_HALF);
+    config_free(&c);
+}
+
 static void a_thousand_faults_do_not_fill_the_journal(void **state)
 {
     (void)state;
@@ -309,6 +335,7 @@ int main(void)
         cmocka_unit_test(a_line_without_half_press_may_be_held_for_all_of_its_limit),
         cmocka_unit_test(what_rigsim_lists_is_accepted_as_it_stands),
         cmocka_unit_test(the_lines_of_a_board_are_outputs_and_inputs),
+        cmocka_unit_test(naming_a_section_asks_for_what_it_does),
         cmocka_unit_test(a_thousand_faults_do_not_fill_the_journal),
         cmocka_unit_test(zero_bytes_and_other_line_ends_are_no_trouble),
         cmocka_unit_test(the_page_listens_where_it_is_told_and_nowhere_unasked),

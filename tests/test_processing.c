@@ -398,6 +398,31 @@ static void the_newest_take_comes_first_and_an_old_long_solve_makes_room(void **
     assert_true(started_at(b, STEP_STANDARD) > came + 10 * S);
 }
 
+static void of_two_the_newer_is_shown_first_but_light_before_both(void **state)
+{
+    (void)state;
+    new_world(1, 1);
+    struct study *light = new_take("20260101_light", 0), *a = new_take("20260102_a", 3), *b = new_take("20260103_b", 3);
+    light->is_panorama = true;
+    a->panorama_of = b->panorama_of = light->id;
+    hold(true);
+    add(a), add(b), add(light);
+    hold(false);
+    run(0);
+    assert_true(started_at(light, STEP_PANORAMA) < started_at(b, STEP_DEVELOP));
+    assert_true(started_at(b, STEP_PREVIEW) < started_at(a, STEP_DEVELOP));
+    assert_true(started_at(a, STEP_PREVIEW) < started_at(b, STEP_STANDARD));
+    // Unless somebody waits for the older one.
+    new_world(1, 1);
+    a = new_take("20260102_a", 3), b = new_take("20260103_b", 3);
+    hold(true);
+    add(a), add(b);
+    processing_urge(w.p, w.now_ns, a->id);
+    hold(false);
+    run(0);
+    assert_true(started_at(a, STEP_PREVIEW) < started_at(b, STEP_DEVELOP));
+}
+
 static void takes_wait_for_the_panorama_that_lights_them(void **state)
 {
     (void)state;
@@ -512,6 +537,50 @@ static void while_the_rig_shoots_nothing_runs_and_time_does_not_count(void **sta
     assert_int_equal(late->record.state, TAKE_SOLVED);
 }
 
+static void what_ends_as_the_rig_begins_is_kept_afterwards(void **state)
+{
+    (void)state;
+    new_world(1, 1);
+    struct study *t = new_take("20260101_a", 1);
+    t->has_thumbnails = false;
+    add(t);
+    run(w.now_ns + S / 2);
+    struct job *j = find_job(0, STEP_DEVELOP, 0);
+    assert_non_null(j);
+    hold(true);
+    j->paused = false; // it was just through
+    end_job(j, JOB_DONE, NULL);
+    obey(); // carry_out() accepts no KEEP while held
+    assert_false(t->place[STEP_DEVELOP][0].made);
+    hold(false);
+    assert_true(t->place[STEP_DEVELOP][0].made);
+    run(0);
+    assert_int_equal(t->record.state, TAKE_SOLVED);
+}
+
+static void pauses_do_not_save_what_hangs(void **state)
+{
+    (void)state;
+    new_world(1, 1);
+    w.settings.timeout_s[STEP_DEVELOP] = 30;
+    new_life();
+    struct study *t = new_take("20260101_a", 1);
+    t->has_thumbnails = false;
+    t->place[STEP_DEVELOP][0].hangs = t->place[STEP_DEVELOP][0].refuses = true;
+    const int64_t began = w.now_ns;
+    add(t);
+    for (int i = 0; i < 35 && !t->n_settled; i++) {
+        run(w.now_ns + S);
+        hold(true);
+        run(w.now_ns + S);
+        hold(false);
+    }
+    assert_int_equal(t->n_settled, 1);
+    for (int i = 0; i < w.n_log; i++)
+        if (w.log[i].kind == PROCESSING_STOP)
+            assert_int_equal(w.log[i].at_ns - began, 59 * S); // 30 s of its own, 29 paused
+}
+
 static void what_hangs_is_stopped_then_killed_and_said(void **state)
 {
     (void)state;
@@ -541,7 +610,7 @@ static void cancelled_is_cancelled_and_can_be_begun_again(void **state)
 {
     (void)state;
     new_world(2, 2);
-    struct study *t = new_take("20260101_a", 8), *other = new_take("20260101_b", 1);
+    struct study *t = new_take("20260101_a", 8), *other = new_take("20251231_b", 1);
     add(t);
     add(other);
     run(w.now_ns + 5 * S / 2);
@@ -761,10 +830,13 @@ int main(void)
     const struct CMUnitTest tests[] = {
         cmocka_unit_test(a_take_is_developed_lit_reconstructed_and_solved),
         cmocka_unit_test(the_newest_take_comes_first_and_an_old_long_solve_makes_room),
+        cmocka_unit_test(of_two_the_newer_is_shown_first_but_light_before_both),
         cmocka_unit_test(takes_wait_for_the_panorama_that_lights_them),
         cmocka_unit_test(what_is_killed_is_started_once_more_what_refuses_is_not),
         cmocka_unit_test(a_failed_preview_spares_the_long_solve),
         cmocka_unit_test(while_the_rig_shoots_nothing_runs_and_time_does_not_count),
+        cmocka_unit_test(what_ends_as_the_rig_begins_is_kept_afterwards),
+        cmocka_unit_test(pauses_do_not_save_what_hangs),
         cmocka_unit_test(what_hangs_is_stopped_then_killed_and_said),
         cmocka_unit_test(cancelled_is_cancelled_and_can_be_begun_again),
         cmocka_unit_test(again_makes_one_step_anew_and_looks_at_what_follows),

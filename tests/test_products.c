@@ -241,7 +241,13 @@ static void the_light_is_the_newest_panorama_before_the_take(void **state)
     make(p, STEP_PANORAMA, 0, NULL, "");
     expect_file(TAKE, "panorama.exr", "better");
     expect_file(LIGHT, "panorama.exr", "better");
-    assert_false(is_there(TAKE, ".panorama.exr.part"));
+    // Asked for anew, though nothing has changed: one file with two names, and no third.
+    assert_int_equal(products_forget(p, 1u << STEP_PANORAMA), 0);
+    assert_int_equal(look(p, STEP_PANORAMA).item[0].verdict, PRODUCT_OWED);
+    make(p, STEP_PANORAMA, 0, NULL, "");
+    struct stat st;
+    assert_int_equal(stat(path, &st), 0);
+    assert_int_equal(st.st_nlink, 2);
     products_close(p);
     // Somebody's own is never replaced.
     make_take("20260103T000000000_own", false);
@@ -430,6 +436,23 @@ static void a_broken_memory_costs_work_and_nothing_else(void **state)
     log_set_level(LOG_INFO);
 }
 
+static void what_a_killed_program_had_begun_is_removed_and_nothing_else(void **state)
+{
+    (void)state;
+    static const char *const ours[] = { ".panorama.exr.abcdef.part", "linear/.A01.exr.abcdef.part", "sheet/.linear.png.abcdef.part", "geometry/.mesh.obj.abcdef.part" };
+    static const char *const others[] = { "raw/A01.nef.part", "thumbnails/A01.jpg.part", ".take.json.abcdef.part", "linear/A01.exr", "geometry/mesh.part" };
+    make_take(TAKE, false);
+    for (int i = 0; i < 4; i++)
+        put(TAKE, ours[i], "half");
+    for (int i = 0; i < 5; i++)
+        put(TAKE, others[i], "copying");
+    products_close(open_take(TAKE));
+    for (int i = 0; i < 4; i++)
+        assert_false(is_there(TAKE, ours[i]));
+    for (int i = 0; i < 5; i++)
+        assert_true(is_there(TAKE, others[i]));
+}
+
 static void a_failed_program_is_quoted(void **state)
 {
     (void)state;
@@ -485,6 +508,7 @@ int main(void)
         cmocka_unit_test_setup_teardown(a_solve_gets_its_name_when_it_is_whole, set_up, tear_down),
         cmocka_unit_test_setup_teardown(take_json_says_what_became_of_it, set_up, tear_down),
         cmocka_unit_test_setup_teardown(a_broken_memory_costs_work_and_nothing_else, set_up, tear_down),
+        cmocka_unit_test_setup_teardown(what_a_killed_program_had_begun_is_removed_and_nothing_else, set_up, tear_down),
         cmocka_unit_test_setup_teardown(a_failed_program_is_quoted, set_up, tear_down),
     };
     return cmocka_run_group_tests(tests, NULL, NULL);

@@ -18,11 +18,18 @@ _rigctl() {
         esac
     done
     case $command in
-    '') mapfile -t COMPREPLY < <(compgen -W "status doctor preflight capture continue cancel takes report preview resume export calibrate identify reinstate metrics events \
+    '') mapfile -t COMPREPLY < <(compgen -W "status doctor preflight capture continue cancel takes report process preview resume export calibrate identify reinstate metrics events \
         panorama develop --socket --json --help --version" -- "$cur") ;;
     calibrate) mapfile -t COMPREPLY < <(compgen -W "lag colour --shots --patch --chart --places --reference --check --flat -o" -- "$cur") ;;
     identify | reinstate) mapfile -t COMPREPLY < <(compgen -W "$(_rigctl_ask status name)" -- "$cur") ;;
-    preview | report | resume | export) mapfile -t COMPREPLY < <(compgen -W "$(_rigctl_ask takes id)" -- "$cur") ;;
+    process)
+        if [[ $before == --again ]]; then
+            mapfile -t COMPREPLY < <(compgen -W "sheet develop panorama reconstruct preview focus standard final" -- "$cur")
+        else
+            mapfile -t COMPREPLY < <(compgen -W "$(_rigctl_ask takes id) --again --cancel --watch" -- "$cur")
+        fi ;;
+    report) mapfile -t COMPREPLY < <(compgen -W "$(_rigctl_ask takes id) --open" -- "$cur") ;;
+    preview | resume | export) mapfile -t COMPREPLY < <(compgen -W "$(_rigctl_ask takes id)" -- "$cur") ;;
     status) mapfile -t COMPREPLY < <(compgen -W "--watch" -- "$cur") ;;
     panorama) [[ $before == --merge ]] && mapfile -t COMPREPLY < <(compgen -f -W "$(_rigctl_ask takes id)" -- "$cur") ||
         mapfile -t COMPREPLY < <(compgen -W "--name --merge -o --json" -- "$cur") ;;
