@@ -312,7 +312,11 @@ static int compare_frame(struct bracket *b, struct rows rows, double h, struct b
     for (int i = 0; i < n; i++)
         v[i] = fabs(v[i] - r->gain);
     r->gain_error = 1.2533 * 1.4826 * median(v, n) / sqrt(n);
-    double chi2 = 0, count = 0;
+    double chi2 = 0, count = 0, sum_m = 0, sum_v = 0;
+    for (int i = 0; i < n_blocks; i++)
+        if (is_compared(b->block + i))
+            sum_m += b->block[i].m, sum_v += b->block[i].v;
+    r->gain_error = fmax(r->gain_error, 1.2533 * sqrt(sum_v) / sum_m); // few blocks may agree by chance
     n = 0;
     for (int i = 0; i < n_blocks; i++)
         if (is_compared(b->block + i)) {

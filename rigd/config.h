@@ -41,6 +41,11 @@ struct trigger_config {      // [trigger]
     uint32_t max_hold_ms;    // no line stays pressed longer, whatever anyone asks; at most 10000
 };
 
+struct web_config {          // [web], rigd/web.h
+    char listen[64];         // "127.0.0.1:8420", "[::1]:8420"; port 0: any free one; "": no page
+    bool token_always;       // on a loopback address, too; others want it anyway
+};
+
 enum develop_quality { DEVELOP_AHD, DEVELOP_BILINEAR, DEVELOP_HALF };
 enum solve_then { SOLVE_THEN_OFF, SOLVE_THEN_STANDARD, SOLVE_THEN_FINAL };
 
@@ -109,6 +114,7 @@ struct config {
     int calibration_shots;
     double lag_max_std_ms;
     struct trigger_config trigger;
+    struct web_config web;
     struct process_config process;
     struct panorama_config panorama;
     int n_cameras;

@@ -1,6 +1,7 @@
 // rigd/contact_main.c - build/bin/rigd-contact: one picture of all cameras of a take, with what to look at. A process of its own: it decodes
 // JPEGs that cameras wrote. Beside OUT.png: OUT.json with each camera's figures; on standard output one line of JSON with the warnings.
 #include "rigd/contact.h"
+#include "solver/take/atomic_file.h"
 #include "solver/take/json.h"
 #include "solver/take/log.h"
 
@@ -16,13 +17,14 @@
 enum { CAMERAS_MAX = 512 };
 
 struct arguments {
-    const char *take, *out;
+    const char *take, *out, *pictures;
     bool linear;
 };
 
 static const struct argp_option options[] = {
     { "thumbnails", 't', NULL, 0, "of TAKE/thumbnails/*.jpg (default)", 0 },
     { "linear", 'l', NULL, 0, "of TAKE/linear/*.exr", 0 },
+    { "pictures", 'p', "DIR", 0, "also each camera in full size as DIR/<camera>.png, 8 bit sRGB, all exposed alike: for tools that read no EXR", 0 },
     { "output", 'o', "OUT.png", 0, "the sheet (required)", 0 },
     { 0 },
 };
@@ -42,6 +44,9 @@ static error_t parse(int key, char *arg, struct argp_state *state)
         if (n < 5 || strcmp(arg + n - 4, ".png"))
             argp_error(state, "-o %s: expected a name that ends in .png", arg);
         a->out = arg;
+        return 0;
+    case 'p':
+        a->pictures = arg;
         return 0;
     case ARGP_KEY_ARG:
         if (a->take)
@@ -94,6 +99,22 @@ static double exposure_of(const struct contact_entry *e, int n, bool linear)
         if (e[i].figures.p99 > 0)
             sum += log2(e[i].figures.p99), n_lit++;
     return n_lit ? log2(.8) - sum / n_lit : 0;
+}
+
+static int write_picture(const char *dir, const char *file, bool linear, double exposure_ev, const char *to)
+{
+    struct image image;
+    char *path = NULL, *png = NULL;
+    int err = asprintf(&path, "%s/%s", dir, file) < 0 || asprintf(&png, "%s/%.*s.png", to, (int)(strrchr(file, '.') - file), file) < 0 ? -ENOMEM : 0;
+    if (!err)
+        err = linear ? image_read(&image, path) : image_read_texture(&image, path, true);
+    if (!err) {
+        err = image_write_png_srgb(&image, png, exposure_ev);
+        image_free(&image);
+    }
+    free(path);
+    free(png);
+    return err;
 }
 
 static int write_figures(const struct contact_entry *e, int n, const char *png)
@@ -152,9 +173,7 @@ int main(int argc, char **argv)
             snprintf(text, sizeof(text), "%s cannot be shown", files[i]->d_name);
             json_append_string(warnings, text);
         }
-        free(files[i]);
     }
-    free(files);
     if (!err && !n)
         err = -EINVAL;
     if (!err) {
@@ -166,6 +185,10 @@ int main(int argc, char **argv)
     }
     if (!err)
         err = contact_write(entry, n, exposure_of(entry, n, a.linear), a.out);
+    if (!err && a.pictures)
+        err = make_directories(a.pictures);
+    for (int i = 0; i < n_files && !err && a.pictures; i++)
+        err = write_picture(dir, files[i]->d_name, a.linear, exposure_of(entry, n, a.linear), a.pictures);
     json_set_int(said, "n", n);
     json_set(said, "warnings", warnings);
     char *text = err ? NULL : json_text(said);
@@ -175,6 +198,9 @@ int main(int argc, char **argv)
     json_free(said);
     for (int i = 0; i < n; i++)
         free(entry[i].cell);
+    for (int i = 0; i < n_files; i++)
+        free(files[i]);
+    free(files);
     free(dir);
     return err ? 1 : 0;
 }

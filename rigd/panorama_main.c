@@ -240,7 +240,7 @@ static void judge_frame(struct job *j, const struct panorama_stop *stop, const d
     if (r->plateau_dn)
         find(j, NOTE, "plateau", stop->name, file, "the sensor clips at %d DN, below what the file calls white: the lower one is taken", r->plateau_dn);
     const double off = fabs(r->gain - 1);
-    if (off > .01 && off > 5 * r->gain_error)
+    if (r->n_blocks >= 2 && off > .01 && off > 5 * r->gain_error)
         find(j, off > .03 ? DOUBT : NOTE, "flicker", stop->name, file, "%.1f %% %s than the others and its exposure say: a flickering lamp, or an inexact shutter",
              100 * off, r->gain > 1 ? "brighter" : "darker");
     if (r->is_repeat && r->n_blocks >= 4 && r->chi2 > 1.25)

@@ -21,7 +21,7 @@ struct texel { // sums over the pixels' parts in it; area in units of 4 pi / (wi
 };
 
 struct cell { // of the coarse grid in which stops are compared: green, unclipped
-    double area, sum;
+    double area, sum, squares, var;
 };
 
 struct stitch {
@@ -347,6 +347,8 @@ static void note_cell(struct stitch *s, const struct corner *c, const struct pix
     struct cell *k = s->stop + (y < 0 ? 0 : y >= CELLS_Y ? CELLS_Y - 1 : y) * CELLS_X + (x < 0 ? 0 : x % CELLS_X);
     k->area += area;
     k->sum += area * (double)p->rgb[RAW_GREEN];
+    k->squares += area * (double)p->rgb[RAW_GREEN] * (double)p->rgb[RAW_GREEN];
+    k->var += area * area * (double)p->var[RAW_GREEN];
 }
 
 // Texels that a clipped pixel of this stop reaches: there its contributions are kept apart.
@@ -383,6 +385,13 @@ static int compare_doubles(const void *a, const void *b)
     return (x > y) - (x < y);
 }
 
+// Seen well, and even: at the edge of a lamp a pixel more or less would be a difference.
+static bool is_plain(const struct cell *c, double whole)
+{
+    const double mean = c->sum / c->area;
+    return c->area > .9 * whole && c->sum > 30 * sqrt(c->var) && c->squares / c->area < 1.05 * mean * mean;
+}
+
 static int compare_with_before(struct stitch *s, struct stitch_stop_report *r)
 {
     enum { N = CELLS_X * CELLS_Y };
@@ -393,7 +402,7 @@ static int compare_with_before(struct stitch *s, struct stitch_stop_report *r)
     for (int i = 0; i < N; i++) {
         const struct cell *a = s->before + i, *b = s->stop + i;
         const double whole = 2 * M_PI / CELLS_X * (cos(M_PI * (i / CELLS_X) / CELLS_Y) - cos(M_PI * (i / CELLS_X + 1) / CELLS_Y));
-        if (a->area > .9 * whole && b->area > .9 * whole && a->sum > 0 && b->sum > 0)
+        if (is_plain(a, whole) && is_plain(b, whole))
             ratio[n++] = b->sum / b->area * a->area / a->sum;
     }
     r->n_cells = n;
@@ -410,6 +419,8 @@ static int compare_with_before(struct stitch *s, struct stitch_stop_report *r)
     for (int i = 0; i < N; i++) {
         s->before[i].area += s->stop[i].area;
         s->before[i].sum += s->stop[i].sum;
+        s->before[i].squares += s->stop[i].squares;
+        s->before[i].var += s->stop[i].var;
         s->stop[i] = (struct cell){ 0 };
     }
     return 0;

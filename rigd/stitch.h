@@ -15,7 +15,7 @@
 struct stitch_stop_report {
     double solid_angle_sr;  // that this stop sees
     double clipped_sr;      // of it clipped
-    // Against the stops before it, in cells of 1/256 of the panorama's width that both see: brightness (median ratio; 1), and the median
+    // Against the stops before it, in cells of 1/256 of the panorama's width that both see well (evenly lit, signal-to-noise ratio above 30): brightness (median ratio; 1), and the median
     // of |log2 ratio| after it. n_cells 0: none in common.
     int n_cells;
     double seam_gain, seam_ev;

@@ -645,7 +645,7 @@ static int find_programs(struct workshop *w)
         w->programs_dir[n] = 0;
         *strrchr(w->programs_dir, '/') = 0;
     }
-    return 0;
+    return setenv("RIGD_TOOLS", w->programs_dir, 1) ? -errno : 0; // for hooks
 }
 
 static void settle_settings(const struct workshop *w, const struct config *config, struct processing_settings *s)

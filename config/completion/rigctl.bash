@@ -20,7 +20,7 @@ _rigctl() {
     case $command in
     '') mapfile -t COMPREPLY < <(compgen -W "status doctor preflight capture continue cancel takes report preview resume export calibrate identify reinstate metrics events \
         panorama develop --socket --json --help --version" -- "$cur") ;;
-    calibrate) mapfile -t COMPREPLY < <(compgen -W "lag colour --shots --patch --chart --places --reference --check -o" -- "$cur") ;;
+    calibrate) mapfile -t COMPREPLY < <(compgen -W "lag colour --shots --patch --chart --places --reference --check --flat -o" -- "$cur") ;;
     identify | reinstate) mapfile -t COMPREPLY < <(compgen -W "$(_rigctl_ask status name)" -- "$cur") ;;
     preview | report | resume | export) mapfile -t COMPREPLY < <(compgen -W "$(_rigctl_ask takes id)" -- "$cur") ;;
     status) mapfile -t COMPREPLY < <(compgen -W "--watch" -- "$cur") ;;

@@ -264,9 +264,11 @@ static double metered_time(const struct image *p)
 {
     const int n = p->width * p->height;
     double *v = malloc((size_t)n * sizeof(*v));
+    int lit = 0; // synthetic rooms have black walls
     for (int i = 0; i < n; i++)
-        v[i] = (double)p->data[3 * i + 1];
-    const double t = exp2(round(log2(.18 / fmax(quantile(v, n, .5), 1e-9))));
+        if (p->data[3 * i + 1] > 0)
+            v[lit++] = (double)p->data[3 * i + 1];
+    const double t = exp2(round(log2(.18 / quantile(v, lit, .5))));
     free(v);
     return t;
 }
