@@ -137,7 +137,7 @@ static const struct key panorama_keys[] = {
     { "longest", SECONDS, FIELD(config, panorama.longest_s), 1e-5, 60, false },
     { "frames_max", INTEGER, FIELD(config, panorama.frames_max), 2, CONFIG_FRAMES_MAX, false },
     { "settle_ms", UNSIGNED, FIELD(config, panorama.settle_ms), 0, 60000, false },
-    { "neutral_density_ev", NUMBER, FIELD(config, panorama.neutral_density_ev), 0, 40, false },
+    { "neutral_density_ev", NUMBER, FIELD(config, panorama.neutral_density_ev), 0, 30, false },
 };
 _Static_assert(offsetof(struct lens, p) == offsetof(struct lens, k) + sizeof(((struct lens *)0)->k), "distortion is read as one list");
 #define COUNT(keys) ((int)(sizeof(keys) / sizeof((keys)[0])))

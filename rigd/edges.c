@@ -48,7 +48,7 @@ int edges_init(struct edges *e, const struct config *config, bool of_cameras, _A
     for (int i = 0; i < config->n_cameras; i++) {
         const int line = of_cameras ? EDGES_LINE_OF(i, EDGES_RELAY) : config->camera[i].relay_line;
         e->relay_of[i] = line == CONFIG_NONE ? CONFIG_NONE : add_wire(e, EDGES_RELAY, line, config->camera[i].name, "relay_line");
-        if (e->full_of[i] == CONFIG_NONE) {
+        if (e->full_of[i] == CONFIG_NONE && i != config_panorama_camera(config)) { // that one its driver can press
             log_error("trigger: camera %s has no full_line and [trigger] has none for all: give it one, or use kind = software",
                 config->camera[i].name);
             return -EINVAL;
@@ -85,7 +85,7 @@ int edges_plan(struct edges *e, const struct trigger_shot *shot, int64_t now_ns)
         return -EBUSY;
     for (int i = 0; i < n_cameras; i++) {
         const int64_t us = shot->delay_us ? shot->delay_us[i] : 0;
-        if (is_skipped(shot, i))
+        if (is_skipped(shot, i) || e->full_of[i] == CONFIG_NONE)
             continue;
         if (us >= 1000000)
             return -EINVAL;
@@ -111,7 +111,7 @@ int edges_plan(struct edges *e, const struct trigger_shot *shot, int64_t now_ns)
         e->due_ns = e->wire[w].press_ns < e->due_ns ? e->wire[w].press_ns : e->due_ns;
     }
     for (int i = 0; half && i < n_cameras; i++) {
-        if (is_skipped(shot, i) || e->half_of[i] == CONFIG_NONE)
+        if (is_skipped(shot, i) || e->full_of[i] == CONFIG_NONE || e->half_of[i] == CONFIG_NONE)
             continue;
         e->in_shot[i] = true;
         e->wire[e->half_of[i]].press_ns = shot->at_ns - half_ns;

@@ -199,7 +199,7 @@ int64_t rig_deadline_ns(const struct rig *r)
             due = sooner(due, b->greet_due_ns);
         if (b->flight.on)
             due = sooner(due, b->flight.due_ns);
-        else if (b->retry_ns && (b->supply != WIRED || (b->greeted && !silent)))
+        else if (b->retry_ns && (b->supply != WIRED || (b->greeted && (!silent || b->press))))
             due = sooner(due, b->retry_ns);
         else if (b->condition == RIG_READY && rig_rests(r))
             due = sooner(due, b->heartbeat_ns);

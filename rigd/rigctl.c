@@ -15,6 +15,7 @@
 #include <string.h>
 #include <sys/socket.h>
 #include <sys/un.h>
+#include <termios.h>
 #include <unistd.h>
 
 enum { EXIT_DONE = 0, EXIT_FAILED = 1, EXIT_USAGE = 2, LINE_MAX_BYTES = 64 << 20, OPTION_OPEN = 256, OPTION_MERGE };
@@ -184,7 +185,6 @@ static bool wait_for_enter(const struct line_reader *r)
     char line[256];
     if (r->n && memchr(r->bytes, '\n', r->n))
         return false;
-    fputs("      Enter when done: ", stderr);
     while (poll(p, 2, -1) < 0 && errno == EINTR)
         ;
     if (p[1].revents || !fgets(line, sizeof(line), stdin))
@@ -217,8 +217,13 @@ static struct json *ask(const struct arguments *a, struct json *request, bool ev
             ; // another take's
         } else if (json_get(m, "event")) {
             print_event(m);
-            if (!strcmp(text_of(m, "event"), "prompt"))
+            if (!strcmp(text_of(m, "event"), "prompt")) {
                 asked = flag_of(m, "body.on") && isatty(0);
+                if (asked) {
+                    tcflush(0, TCIFLUSH); // what was typed before was no answer to this
+                    fputs("      Enter when done: ", stderr);
+                }
+            }
             if (asked)
                 asked = !wait_for_enter(&r);
         } else if (!json_get_int(m, "id", &id) && id == 2)

@@ -1,5 +1,6 @@
 // tests/test_describe.c - what clients see of a take and of the rig is what is, and Prometheus can read it.
 #include "rigd/describe.h"
+#include "rigd/panorama_plan.h"
 #include "solver/take/atomic_file.h"
 #include "solver/take/log.h"
 
@@ -198,6 +199,66 @@ static void status_and_lag_say_only_what_is_known(void **state)
     json_free(s);
 }
 
+// What rigd-panorama reads: the frames that can be used, in the order in which they were shot, stop by stop; a stop without any is there too.
+static void the_plan_of_a_panorama_is_what_the_merge_reads(void **state)
+{
+    (void)state;
+    struct ledger l;
+    struct panorama_plan plan;
+    struct config c = config;
+    strcpy(c.panorama.camera_name, config.camera[0].name);
+    c.panorama.camera = 0;
+    c.panorama.lens = (struct lens){ .model = LENS_EQUISOLID, .width_px = 600, .height_px = 400, .focal_px = 141, .centre_px = { 300, 200 }, .k = { .01, -.02, 0 }, .p = { .001, -.002 }, .circle_px = 190 };
+    assert_int_equal(lens_init(&c.panorama.lens, "t"), 0);
+    c.panorama.nodal_offset_m = .01;
+    c.panorama.neutral_density_ev = 6;
+    c.panorama.n_stops = 3;
+    c.panorama.stop[1] = (struct config_stop){ 120, 5 };
+    c.panorama.stop[2] = (struct config_stop){ 240, -5 };
+    ledger_init_panorama(&l, &c);
+    strcpy(l.id, "20261122T090000000_panorama");
+    l.state = TAKE_VERIFIED;
+    for (int e = 0; e < 5; e++) {
+        const struct camera_object o = { "/store_00010001/DCIM/100NIKON", "DSC_0002.NEF", 1000 };
+        assert_int_equal(ledger_expose(&l, &c, e / 3, e % 3, exp2(-e)), e);
+        struct ledger_camera *k = &l.camera[e];
+        ledger_add(k, &o)->state = OBJECT_COPIED;
+        k->debt = DEBT_PAID;
+        k->exposure.object = 0;
+        k->exposure.facts.light.exposure_s = exp2(-e);
+        k->exposure.rejected = e == 1;
+    }
+    struct json *o = describe_plan(&l, &c);
+    char *said = json_text(o);
+    assert_int_equal(panorama_plan_parse(&plan, said, strlen(said), "plan", "/takes/x/panorama"), 0);
+    assert_int_equal(plan.n_stops, 3);
+    assert_int_equal(plan.stop[0].n_frames, 2);
+    assert_int_equal(plan.stop[1].n_frames, 2);
+    assert_int_equal(plan.stop[2].n_frames, 0);
+    assert_string_equal(plan.stop[0].frame[1].file, "/takes/x/panorama/raw/00_02.nef");
+    assert_true(plan.stop[0].frame[1].exposure_s == .25);
+    assert_true(plan.stop[1].yaw_deg == 120 && plan.stop[2].pitch_deg == -5);
+    assert_true(plan.nodal_offset_m == .01);
+    assert_memory_equal(plan.lens.k, c.panorama.lens.k, sizeof(plan.lens.k));
+    assert_memory_equal(plan.lens.p, c.panorama.lens.p, sizeof(plan.lens.p));
+    assert_true(plan.lens.focal_px == 141 && plan.lens.circle_px == 190 && plan.lens.model == LENS_EQUISOLID);
+    assert_true(fabs(plan.lens.max_angle_rad - c.panorama.lens.max_angle_rad) < 1e-12);
+    free(said);
+    json_free(o);
+    panorama_plan_free(&plan);
+    o = describe_take(&l, false);
+    assert_string_equal(text(o, "kind"), "panorama");
+    assert_true(number(o, "n_expected") == 5);
+    json_free(o);
+    const struct rig_progress p = { RIG_STEP_FRAME, 1, 3, 4, 120, 5, "1/250", "brightest" };
+    o = describe_progress(&l, &p);
+    assert_string_equal(text(o, "step"), "frame");
+    assert_string_equal(text(o, "exposure"), "1/250");
+    assert_true(number(o, "stop") == 2 && number(o, "n_stops") == 3 && number(o, "frame") == 5);
+    json_free(o);
+    ledger_free(&l);
+}
+
 int main(void)
 {
     const struct CMUnitTest tests[] = {
@@ -205,6 +266,7 @@ int main(void)
         cmocka_unit_test(takes_are_listed_oldest_first_and_what_is_none_is_not),
         cmocka_unit_test(metrics_are_as_prometheus_reads_them),
         cmocka_unit_test(status_and_lag_say_only_what_is_known),
+        cmocka_unit_test(the_plan_of_a_panorama_is_what_the_merge_reads),
     };
     return cmocka_run_group_tests(tests, set_up, tear_down);
 }

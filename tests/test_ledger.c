@@ -509,6 +509,7 @@ static void a_panorama_s_ledger_reads_back_as_it_was_written(void **state)
     log_set_level(LOG_INFO);
     free(text), free(again);
     ledger_free(&l), ledger_free(&back);
+    free(config.camera);
 }
 
 static void a_ledger_reads_back_as_it_was_written(void **state)

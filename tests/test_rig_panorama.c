@@ -233,6 +233,28 @@ static void one_fault_at_any_command_costs_no_stop(void **state)
         }
 }
 
+static void without_a_line_of_its_own_its_driver_presses_it(void **state)
+{
+    (void)state;
+    for (int fault = 0; fault < 6; fault++) {
+        begin(HEAD_MANUAL, 70 + (uint64_t)fault);
+        w.config.trigger.kind = TRIGGER_GPIO; // a common line for the others
+        struct fault *f = &w.camera[CAMERA].fault;
+        int *const which[] = { &f->hang[CAMERA_TRIGGER], &f->crash[CAMERA_TRIGGER], &f->lost[CAMERA_TRIGGER], &f->busy[CAMERA_TRIGGER], &f->fails[CAMERA_TRIGGER] };
+        f->trouble = CAMERA_REFUSED;
+        if (fault < 5)
+            *which[fault] = 2;
+        const struct ledger *l = panorama();
+        check(l);
+        if (l->state != TAKE_VERIFIED)
+            fail_msg("fault %d: %s", fault, l->reason);
+        check_brackets(l);
+        assert_int_equal(w.n_fired, 0);
+        assert_int_equal(w.camera[0].n_card, 0);
+        tear_down();
+    }
+}
+
 static void a_frame_that_is_missing_is_exposed_again(void **state)
 {
     (void)state;
@@ -608,6 +630,7 @@ int main(void)
         cmocka_unit_test(an_ordinary_take_does_without_the_panorama_camera),
         cmocka_unit_test(a_light_that_clips_in_the_shortest_is_declared),
         cmocka_unit_test(one_fault_at_any_command_costs_no_stop),
+        cmocka_unit_test(without_a_line_of_its_own_its_driver_presses_it),
         cmocka_unit_test(a_frame_that_is_missing_is_exposed_again),
         cmocka_unit_test(a_turned_aperture_and_a_frame_of_another_time_are_not_used),
         cmocka_unit_test(a_head_that_sticks_is_asked_again_then_named),

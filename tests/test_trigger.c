@@ -292,6 +292,27 @@ static void a_camera_without_any_line_is_refused(void **state)
     log_set_level(LOG_INFO);
 }
 
+// The one that makes panoramas may do without: its driver presses it, and a shot of all others leaves it alone.
+static void the_panorama_camera_needs_no_line(void **state)
+{
+    (void)state;
+    struct edges e;
+    studio(3);
+    camera[2].full_line = camera[2].half_line = CONFIG_NONE;
+    strcpy(config.panorama.camera_name, "A02");
+    config.panorama.camera = 2;
+    plan_for(&e, &config);
+    const struct trigger_shot shot = { .at_ns = 1000 * MS, .half_ms = 100, .hold_ms = 50 };
+    assert_int_equal(edges_plan(&e, &shot, 0), 0);
+    for (int64_t now_ns; (now_ns = edges_next_ns(&e)) != EDGES_NEVER;) {
+        struct edges_step step;
+        edges_step(&e, now_ns, &step);
+    }
+    const uint64_t others = 3;
+    const struct trigger_shot alone = { .at_ns = 9000 * MS, .hold_ms = 50, .skip = &others };
+    assert_int_equal(edges_plan(&e, &alone, 0), -EINVAL); // nobody is left to press
+}
+
 static void a_supply_comes_back_however_often_it_is_cut(void **state)
 {
     (void)state;
@@ -944,6 +965,7 @@ int main(void)
         cmocka_unit_test(a_press_that_comes_far_too_late_is_not_done),
         cmocka_unit_test(refuses_what_it_must_not_do),
         cmocka_unit_test(a_camera_without_any_line_is_refused),
+        cmocka_unit_test(the_panorama_camera_needs_no_line),
         cmocka_unit_test(a_supply_comes_back_however_often_it_is_cut),
         cmocka_unit_test(one_shot_is_three_calls_to_the_chip),
         cmocka_unit_test(release_in_the_middle_opens_everything_and_says_so_once),
