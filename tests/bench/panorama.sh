@@ -8,6 +8,8 @@ mkdir -p "$out"
 [ -d "$out/synth" ] || "$bin/rigsolve" synth D3 -o "$out/synth" --size 180x120 --true-lights 4096 --panorama-width 1024 --samples 1 --seed 1
 echo "== radiance, beside hat weights and one exposure ($out/figures.csv)"
 "$bench" figures "$@" | tee "$out/figures.csv"
+echo "== variance"
+"$bench" variance "$@"
 echo "== 24 megapixels"
 "$bench" frames "$out/frames"
 for rig in fisheye rectilinear; do
