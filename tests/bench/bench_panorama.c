@@ -3,7 +3,7 @@
 //   bench_panorama figures PANORAMA...   each through a fisheye of 1, 2, 3, 4 stops and a rectilinear head of 12 stops, CSV on standard output
 //   bench_panorama variance PANORAMA...  of one fisheye stop: error^2 over the Poisson bound and over the bound with read noise, by electrons
 //   bench_panorama frames DIR            24-megapixel frames of one stop and plans of 3 x 7 (fisheye) and 12 x 7 (rectilinear) frames that use them
-//   bench_panorama take PANORAMA DIR     the whole chain: raws of a fisheye of 3 stops and their plan, for rigd-panorama
+//   bench_panorama take PANORAMA DIR     the whole chain: raws of a fisheye of 3 stops and their plan, for rigd-panorama; true.exr: what was photographed
 #include "rigd/stitch.h"
 #include "solver/lights.h"
 #include "solver/take/log.h"
@@ -261,6 +261,34 @@ static void photograph(struct figures out[METHODS], const struct rig *rig, const
         image_free(p + k);
 }
 
+// A synthetic studio's panorama is of point lights, a texel each: no camera resolves that, nor do photosites of a colour add up to it. They
+// are spread over blocks of texels until nearly every block is lit.
+static void spread_points(struct image *p)
+{
+    for (int side = 1; side <= 64; side *= 2) {
+        const int nx = p->width / side, ny = p->height / side;
+        int lit = 0;
+        for (int b = 0; b < nx * ny; b++) {
+            double sum[3] = { 0 }, area = 0;
+            for (int pass = 0; pass < 2; pass++)
+                for (int k = 0; k < side * side; k++) {
+                    const int y = b / nx * side + k / side, x = b % nx * side + k % side;
+                    float *v = p->data + 3 * ((size_t)y * (size_t)p->width + (size_t)x);
+                    const double w = panorama_solid_angle(p->width, p->height, y);
+                    area += pass ? 0 : w;
+                    for (int c = 0; c < 3; c++)
+                        if (pass)
+                            v[c] = (float)(sum[c] / area);
+                        else
+                            sum[c] += w * (double)v[c];
+                }
+            lit += sum[1] > 0;
+        }
+        if (lit > .95 * nx * ny)
+            return;
+    }
+}
+
 static double metered_time(const struct image *p)
 {
     const int n = p->width * p->height;
@@ -281,7 +309,10 @@ static int figures(int n, char **paths)
         struct panorama p;
         struct lights lights;
         const char *name = strrchr(paths[i], '/') ? strrchr(paths[i], '/') + 1 : paths[i];
-        if (panorama_read(&p, paths[i]) || lights_median_cut(&lights, &p, LIGHTS))
+        if (panorama_read(&p, paths[i]))
+            return 1;
+        spread_points(&p.image);
+        if (lights_median_cut(&lights, &p, LIGHTS))
             return 1;
         for (int k = 1; k <= 5; k++) {
             const struct rig rig = k < 5 ? fisheye(k, 1400) : rectilinear(900);
@@ -320,6 +351,7 @@ static int variances(int n_paths, char **paths)
         int metered;
         if (panorama_read(&p, paths[i]))
             return 1;
+        spread_points(&p.image);
         float *seen = sim_see(&p.image, c, 4);
         const int n = shoot_stop(f, seen, c, metered_time(&p.image), 0, &needs_nd, &metered);
         if (bracket_new(&b, f, &options))
@@ -420,7 +452,12 @@ static int take(const char *panorama, const char *dir)
     struct panorama p;
     struct rig rig = fisheye(3, 1400);
     mkdir(dir, 0777);
+    char path_true[1024];
     if (panorama_read(&p, panorama))
+        return 1;
+    spread_points(&p.image);
+    snprintf(path_true, sizeof(path_true), "%s/true.exr", dir);
+    if (image_write_exr(&p.image, path_true, IMAGE_FLOAT, IMAGE_ZIP))
         return 1;
     const double metered_s = metered_time(&p.image);
     FILE *plan = open_plan(dir, "panorama.json");
