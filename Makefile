@@ -12,7 +12,8 @@ MACHINE := $(shell uname -m)
 
 # ---- packages (Debian 12; the same names in Debian 13) ----------------------------------------------------------------
 PACKAGES := gcc make pkg-config libopenexr-dev libembree-dev libassimp-dev libjansson-dev libtiff-dev libpng-dev libjpeg-dev libexpat1-dev liblapacke-dev libopenblas-dev libcmocka-dev perl help2man dcraw \
-  libgphoto2-dev libgpiod-dev libinih-dev libraw-dev libsystemd-dev libumockdev-dev libxxhash-dev
+  libgphoto2-dev libgpiod-dev libinih-dev libmicrohttpd-dev libraw-dev libsystemd-dev libumockdev-dev libusb-1.0-0-dev libxxhash-dev \
+  gcc-avr avr-libc libsimavr-dev libelf-dev
 PACKAGES_FUZZ := clang libclang-rt-dev
 PACKAGES_BENCH := libceres-dev g++ gnuplot-nox
 
@@ -35,23 +36,26 @@ endif
 TAKE := $(wildcard solver/take/*.c)
 LIBRARY := $(TAKE) $(filter-out solver/main.c,$(wildcard solver/*.c)) $(wildcard solver/kernels/*.c)
 COMMANDS := $(wildcard solver/commands/*.c)
-RIG_PROGRAMS := rigctl rigd rigd-camera rigd-develop rigd-panorama rigd-unpack
-RIG := $(filter-out $(addprefix rigd/,camera_gphoto.c camera_worker.c daemon.c develop.c develop_main.c main.c panorama_main.c rigctl.c rigctl_develop.c unpack.c),$(wildcard rigd/*.c))
+RIG_PROGRAMS := rigctl rigd rigd-camera rigd-contact rigd-develop rigd-panorama rigd-unpack
+RIG := $(filter-out $(addprefix rigd/,camera_gphoto.c camera_worker.c contact_main.c daemon.c develop.c develop_main.c main.c panorama_main.c rigctl.c rigctl_develop.c unpack.c),$(wildcard rigd/*.c))
 RIGSIM := $(wildcard tests/rigsim/*.c)
-RIGSIM_LIB := $(filter-out $(addprefix tests/rigsim/,client.c main.c server.c server_faults.c server_shutter.c),$(RIGSIM))
-LIBS_RIG = -ljansson -linih -lsystemd -lxxhash -lgpiod -lm
+RIGSIM_LIB := $(filter-out $(addprefix tests/rigsim/,client.c main.c server.c server_faults.c server_head.c server_shutter.c),$(RIGSIM))
+LIBS_RIG = -ljansson -lusb-1.0 -linih -lsystemd -lxxhash -lgpiod -lmicrohttpd -lm
 LIBS_RAW = -lraw_r -lgomp -lm
 LIBS_CAMERA = -lgphoto2 -lgphoto2_port -ljansson -lxxhash -lm
+FIRMWARE_LOGIC := $(filter-out firmware/main.c firmware/board_%.c,$(wildcard firmware/*.c))
+FIRMWARE_SIM := $(FIRMWARE_LOGIC) firmware/board_sim.c # the same logic on the host
 TESTS := $(basename $(notdir $(wildcard tests/test_*.c))) check_kernels
+BOARD_TESTS := test_trigger_usb test_board_shots test_board_loss
 FUZZERS := $(patsubst fuzz_%,%,$(basename $(notdir $(wildcard tests/fuzz/fuzz_*.c))))
-FUZZED := $(LIBRARY) $(RIG) $(RIGSIM_LIB) # what a fuzzer calls of these is linked
+FUZZED := $(LIBRARY) $(RIG) $(RIGSIM_LIB) $(FIRMWARE_SIM) # what a fuzzer calls of these is linked
 
 # ---- rules --------------------------------------------------------------------------------------------------------------
 object = $(patsubst %.c,$(BUILD)/obj/%.o,$(1))
-ifneq ($(filter test test-vm demo bench bench-develop bench-panorama bench-rig chart figure5 figures stability experiments,$(MAKECMDGOALS)),)
+ifneq ($(filter firmware test test-vm demo bench bench-develop bench-firmware bench-panorama bench-rig chart figure5 figures stability experiments,$(MAKECMDGOALS)),)
 FIRST := deps # these install what is missing before the first file is compiled
 endif
-.PHONY: all deps deps-fuzz deps-bench test test-vm demo bench bench-develop bench-rig chart figure5 figures stability experiments fuzz check-includes man install clean help
+.PHONY: all firmware deps deps-fuzz deps-bench test test-vm demo bench bench-develop bench-firmware bench-panorama bench-rig chart figure5 figures stability experiments fuzz check-includes man install clean help
 .DELETE_ON_ERROR:
 .SECONDARY:
 
@@ -65,6 +69,7 @@ $(BUILD)/obj/%.o: %.cc Makefile | $(FIRST)
 	@mkdir -p $(@D)
 	@$(if $(V),,echo '  CXX $<')
 	$(Q)$(CXX) -std=c++17 -O3 -g -march=native -I. -I/usr/include/eigen3 -MMD -MP -c $< -o $@
+$(BUILD)/obj/rigd/web.o $(BUILD)/fuzz/obj/rigd/web.o: $(wildcard rigd/web/page.*) # they go into it
 $(BUILD)/obj/solver/kernels/kernels_avx2.o: ISA := $(ISA_avx2)
 $(BUILD)/obj/solver/kernels/kernels_avx512.o: ISA := $(ISA_avx512)
 $(BUILD)/obj/solver/kernels/kernels_%.o: FLAGS_release := -O3 -g
@@ -84,24 +89,26 @@ $(BUILD)/bin/rigsolve: $(call object,$(COMMANDS) solver/main.c) $(BUILD)/libstud
 	@mkdir -p $(@D)
 	@$(if $(V),,echo '  LD $@')
 	$(Q)$(CC) $(CFLAGS_ALL) $^ $(LIBS) -o $@
-link_rig = @mkdir -p $(@D); $(if $(V),,echo '  LD $@';) $(CC) $(CFLAGS_ALL) $^
+link_rig = @mkdir -p $(@D); $(if $(V),,echo '  LD $@';) $(CC) $(CFLAGS_ALL) -Wl,--as-needed $^
 $(BUILD)/bin/rigd: $(call object,rigd/main.c rigd/daemon.c) $(BUILD)/librig.a $(BUILD)/libtake.a
 	$(link_rig) $(LIBS_RIG) -o $@
 $(BUILD)/bin/rigctl: $(call object,rigd/rigctl.c rigd/rigctl_develop.c) $(BUILD)/librig.a $(BUILD)/libtake.a
 	$(link_rig) $(LIBS_RIG) -o $@
 $(BUILD)/bin/rigd-camera: $(call object,rigd/camera_gphoto.c rigd/camera_worker.c) $(BUILD)/librig.a $(BUILD)/libtake.a
 	$(link_rig) $(LIBS_CAMERA) -o $@
-$(BUILD)/bin/rigd-unpack: $(call object,rigd/develop.c rigd/exif.c rigd/unpack.c)
-	$(link_rig) $(LIBS_RAW) -o $@
+$(BUILD)/bin/rigd-contact: $(call object,rigd/contact.c rigd/contact_main.c) $(BUILD)/libtake.a
+	$(link_rig) $(LIBS) -o $@
+$(BUILD)/bin/rigd-unpack: $(call object,rigd/develop.c rigd/unpack.c) $(BUILD)/librig.a $(BUILD)/libtake.a
+	$(link_rig) $(LIBS_RAW) -ljansson -o $@
 $(BUILD)/bin/rigd-develop: $(call object,rigd/develop.c rigd/develop_main.c) $(BUILD)/librig.a $(BUILD)/libtake.a
 	$(link_rig) $(LIBS_RAW) -lOpenEXRCore -ltiff -lpng -ljpeg -ljansson -lxxhash -o $@
 $(BUILD)/bin/rigd-panorama: $(call object,rigd/develop.c rigd/panorama_main.c) $(BUILD)/librig.a $(BUILD)/libtake.a
 	$(link_rig) -lOpenEXRCore -ltiff -lpng -ljpeg -ljansson $(LIBS_RAW) -o $@
-$(BUILD)/bin/rigsim: $(call object,$(filter-out %/client.c,$(RIGSIM))) $(BUILD)/libstudiorig.a
+$(BUILD)/bin/rigsim: $(call object,$(filter-out %/client.c,$(RIGSIM))) $(BUILD)/librig.a $(BUILD)/libstudiorig.a
 	@mkdir -p $(@D)
 	@$(if $(V),,echo '  LD $@')
 	$(Q)$(CC) $(CFLAGS_ALL) $^ $(LIBS) -o $@
-$(BUILD)/librigsim.a: $(call object,$(RIGSIM_LIB) tests/rigsim/client.c $(wildcard tests/usb/*.c))
+$(BUILD)/librigsim.a: $(call object,$(RIGSIM_LIB) tests/rigsim/client.c $(wildcard tests/usb/*.c) $(filter-out %/boardsim.c,$(wildcard tests/board/*.c)))
 	@rm -f $@
 	@$(if $(V),,echo '  AR $@')
 	$(Q)ar rcsD $@ $^
@@ -110,14 +117,22 @@ $(BUILD)/tests/%: $(BUILD)/obj/tests/%.o $(BUILD)/librigsim.a $(BUILD)/librig.a 
 	@$(if $(V),,echo '  LD $@')
 	$(Q)$(CC) $(CFLAGS_ALL) -Wl,--as-needed $^ -lcmocka $(LIBS_RIG) $(LIBS) -o $@
 $(BUILD)/tests/test_camera_worker $(BUILD)/tests/test_config $(BUILD)/tests/test_rigsim_wire: | $(BUILD)/bin/rigd-camera $(BUILD)/bin/rigsim
+$(BUILD)/tests/test_developing: | $(BUILD)/bin/rigd-develop $(BUILD)/bin/rigctl
+$(BUILD)/tests/test_develop: | $(BUILD)/bin/rigd-unpack
 $(BUILD)/tests/test_develop: $(call object,rigd/develop.c)
 $(BUILD)/tests/test_develop: LIBS += $(LIBS_RAW)
 $(BUILD)/tests/test_rigd_panorama: | $(BUILD)/bin/rigd-panorama
 $(BUILD)/tests/bench/stability_joint: $(call object,solver/commands/arguments.c)
-$(BUILD)/obj/tests/test_usb_camera.o $(BUILD)/obj/tests/usb/usb_camera.o: CFLAGS_ALL += $(shell pkg-config --cflags umockdev-1.0 2>/dev/null)
-$(BUILD)/tests/test_usb_camera: LIBS += $(shell pkg-config --libs umockdev-1.0 2>/dev/null)
-$(BUILD)/tests/test_usb_camera: | $(BUILD)/bin/rigd $(BUILD)/bin/rigd-camera
+$(addprefix $(BUILD)/obj/tests/,test_usb_camera.o $(addsuffix .o,$(BOARD_TESTS)) usb/usb_camera.o usb/usbfs.o board/fake_board.o board/live_board.o board/boardsim.o): CFLAGS_ALL += $(shell pkg-config --cflags umockdev-1.0 2>/dev/null)
+$(BUILD)/tests/test_usb_camera $(addprefix $(BUILD)/tests/,$(BOARD_TESTS)) $(BUILD)/tests/board/boardsim: LIBS += $(shell pkg-config --libs umockdev-1.0 2>/dev/null)
+$(addprefix $(BUILD)/tests/,$(BOARD_TESTS)) $(BUILD)/tests/board/boardsim: LIBS += -lsimavr -lelf
+$(addprefix $(BUILD)/tests/,$(BOARD_TESTS)) $(BUILD)/tests/board/boardsim: | build/firmware/trigger.elf
+$(BUILD)/tests/test_usb_camera $(addprefix $(BUILD)/tests/,$(BOARD_TESTS)): | $(BUILD)/bin/rigd $(BUILD)/bin/rigd-camera
 $(BUILD)/tests/test_pcg: LIBS += $(if $(wildcard /usr/include/suitesparse/cholmod.h),-lcholmod)
+$(BUILD)/tests/test_firmware: $(call object,$(FIRMWARE_SIM))
+$(BUILD)/tests/bench/bench_firmware: $(call object,$(FIRMWARE_SIM))
+$(BUILD)/tests/test_firmware_avr $(BUILD)/tests/bench/bench_firmware: LIBS += -lsimavr -lelf
+$(BUILD)/tests/test_firmware_avr $(BUILD)/tests/bench/bench_firmware: | build/firmware/trigger.elf
 $(BUILD)/fuzz/obj/%.o: %.c Makefile | deps-fuzz
 	@mkdir -p $(@D)
 	@$(if $(V),,echo '  CC (fuzz) $<')
@@ -128,6 +143,22 @@ $(BUILD)/fuzz/libfuzzed.a: $(patsubst %.c,$(BUILD)/fuzz/obj/%.o,$(FUZZED))
 $(BUILD)/fuzz/fuzz_%: $(BUILD)/fuzz/obj/tests/fuzz/fuzz_%.o $(BUILD)/fuzz/libfuzzed.a
 	@$(if $(V),,echo '  LD (fuzz) $@')
 	$(Q)clang $(FUZZ_FLAGS) -fsanitize=fuzzer -Wl,--as-needed $^ $(LIBS_RIG) $(LIBS) -o $@
+
+# ---- firmware of the trigger board: one image, whatever the variant ------------------------------------------------------------
+AVR_FLAGS := -std=gnu11 -mmcu=atmega32u4 -DF_CPU=16000000UL -Os -g -ffunction-sections -fdata-sections -Wall -Wextra -Wshadow -Wstrict-prototypes \
+  -fdebug-prefix-map=$(CURDIR)=. -I.
+firmware: deps build/firmware/trigger.hex
+	@avr-size -C --mcu=atmega32u4 build/firmware/trigger.elf | sed '/^$$/d'
+	@echo "firmware: build/firmware/trigger.hex; how to flash it: firmware/README.md"
+build/firmware/%.o: firmware/%.c Makefile | $(FIRST)
+	@mkdir -p $(@D)
+	@$(if $(V),,echo '  AVR-CC $<')
+	$(Q)avr-gcc $(AVR_FLAGS) -MMD -MP -c $< -o $@
+build/firmware/trigger.elf: $(patsubst firmware/%.c,build/firmware/%.o,$(FIRMWARE_LOGIC) firmware/board_atmega32u4.c firmware/main.c)
+	@$(if $(V),,echo '  AVR-LD $@')
+	$(Q)avr-gcc $(AVR_FLAGS) -Wl,--gc-sections $^ -o $@
+build/firmware/trigger.hex: build/firmware/trigger.elf
+	$(Q)avr-objcopy -O ihex -R .eeprom $< $@
 
 # dpkg-query knows what is there; apt-get is asked only for what is not.
 install_packages = @missing=$$(for p in $(1); do dpkg-query -W -f='$${Status}\n' $$p 2>/dev/null | grep -q 'ok installed' || echo $$p; done); \
@@ -143,7 +174,7 @@ deps-bench: deps ; $(call install_packages,$(PACKAGES_BENCH))
 # ---- tests ----------------------------------------------------------------------------------------------------------------
 TEST_PROGRAMS := $(addprefix $(BUILD)/tests/,$(TESTS))
 TEST_SCRIPTS := $(wildcard tests/check_*.sh tests/test_*.sh)
-test: deps all $(TEST_PROGRAMS)
+test: deps all $(TEST_PROGRAMS) $(BUILD)/tests/board/boardsim
 	@CMOCKA_MESSAGE_OUTPUT=TAP BIN=$(BUILD)/bin prove -j $(shell nproc) --timer --merge --exec '' $(TEST_PROGRAMS) $(TEST_SCRIPTS)
 test-vm: deps $(BUILD)/tests/vm/test_gpio_vm
 	@prove --timer --verbose --exec '' tests/vm/run.sh :: $(BUILD)/vm $(BUILD)/tests/vm/test_gpio_vm
@@ -171,6 +202,8 @@ bench: deps $(BENCH_PROGRAMS) $(BUILD)/bin/rigsolve
 PANORAMAS ?= $(wildcard ../shared/data/hdri/studio_small_03_1k.hdr) build/panorama/synth/panorama.exr
 bench-panorama: deps deps-bench $(BUILD)/tests/bench/bench_panorama $(BUILD)/bin/rigd-panorama $(BUILD)/bin/rigsolve
 	@BIN=$(BUILD)/bin BENCH=$(BUILD)/tests/bench/bench_panorama sh tests/bench/panorama.sh build/panorama $(PANORAMAS)
+bench-firmware: deps $(BUILD)/tests/bench/bench_firmware
+	@$(BUILD)/tests/bench/bench_firmware $(FIRMWARE_BENCH)
 RIG_BENCHES ?= scale faults soak lag full eio kills
 bench-rig: deps all
 	@for b in $(RIG_BENCHES); do echo "== $$b"; BIN=$(BUILD)/bin perl tests/bench/rig.pl $$b || failed=1; done; [ -z "$$failed" ]
@@ -196,11 +229,20 @@ stability: deps deps-bench $(BUILD)/tests/bench/stability_kernels $(BUILD)/tests
 
 # ---- installation ---------------------------------------------------------------------------------------------------------
 MAN := $(addprefix $(BUILD)/man/rigsolve,.1 $(addprefix -,$(addsuffix .1,$(filter-out arguments inputs output solve_materials solved,$(notdir $(COMMANDS:.c=))))))
-RIG_MAN := $(addprefix $(BUILD)/man/,rigctl.1 rigd.8)
+RIG_MAN := $(addprefix $(BUILD)/man/,rigctl.1 rigctl-develop.1 rigctl-calibrate-colour.1 rigd-develop.1 rigd.8)
 man: $(MAN) $(RIG_MAN)
 $(BUILD)/man/rigctl.1: $(BUILD)/bin/rigctl
 	@mkdir -p $(@D)
 	$(Q)help2man -N -n 'asks and tells the daemon of a photogrammetry rig' -o $@ $<
+$(BUILD)/man/rigctl-develop.1: $(BUILD)/bin/rigctl
+	@mkdir -p $(@D)
+	$(Q)help2man -N -n 'raw files become linear pictures' --version-string=$(VERSION) -o $@ "$< develop"
+$(BUILD)/man/rigctl-calibrate-colour.1: $(BUILD)/bin/rigctl
+	@mkdir -p $(@D)
+	$(Q)help2man -N -n 'one radiometric space for all bodies of a rig' --version-string=$(VERSION) -o $@ "$< calibrate colour"
+$(BUILD)/man/rigd-develop.1: $(BUILD)/bin/rigd-develop
+	@mkdir -p $(@D)
+	$(Q)help2man -N -n 'one raw file becomes one linear picture' -o $@ $<
 $(BUILD)/man/rigd.8: $(BUILD)/bin/rigd
 	@mkdir -p $(@D)
 	$(Q)help2man -N -s 8 -n 'fires the cameras of a photogrammetry studio and keeps every frame' -o $@ $<
@@ -213,13 +255,14 @@ $(BUILD)/man/rigsolve-%.1: $(BUILD)/bin/rigsolve
 install: all $(MAN) $(RIG_MAN)
 	install -D -m 755 -t $(DESTDIR)$(PREFIX)/bin $(addprefix $(BUILD)/bin/,rigsolve $(RIG_PROGRAMS))
 	install -D -m 644 -t $(DESTDIR)$(PREFIX)/share/man/man1 $(MAN)
-	install -D -m 644 -t $(DESTDIR)$(PREFIX)/share/man/man1 $(BUILD)/man/rigctl.1
+	install -D -m 644 -t $(DESTDIR)$(PREFIX)/share/man/man1 $(filter %.1,$(RIG_MAN))
 	install -D -m 644 -t $(DESTDIR)$(PREFIX)/share/man/man8 $(BUILD)/man/rigd.8
 	install -D -m 644 config/blender/import_studiorig.py $(DESTDIR)$(PREFIX)/share/studiorig/blender/import_studiorig.py
 	install -D -m 644 config/completion/rigsolve.bash $(DESTDIR)$(PREFIX)/share/bash-completion/completions/rigsolve
 	install -D -m 644 config/completion/rigctl.bash $(DESTDIR)$(PREFIX)/share/bash-completion/completions/rigctl
 	install -D -m 644 -t $(DESTDIR)$(PREFIX)/share/studiorig/config config/*.conf
 	install -D -m 644 -t $(DESTDIR)$(PREFIX)/share/studiorig/config/cameras config/cameras/*.conf
+	install -D -m 755 -t $(DESTDIR)$(PREFIX)/share/studiorig/config/reconstruct config/reconstruct/*
 	install -D -m 644 config/systemd/rigd.service $(DESTDIR)$(PREFIX)/lib/systemd/system/rigd.service
 	sed -i 's|/usr/local/bin|$(PREFIX)/bin|' $(DESTDIR)$(PREFIX)/lib/systemd/system/rigd.service
 	install -D -m 644 config/systemd/71-rigd.rules $(DESTDIR)$(PREFIX)/lib/udev/rules.d/71-rigd.rules
@@ -231,6 +274,7 @@ clean:
 help:
 	@echo 'make            the programs, in build/bin/       make test      everything that must hold (installs packages)'
 	@echo 'make demo       a synthetic studio, end to end    make fuzz      libFuzzer on every parser (FUZZ_SECONDS=60)'
+	@echo 'make firmware   the image of the trigger board    make bench-firmware  its latencies, edges, a long fuzz'
 	@echo 'make test-vm    GPIO on a simulated chip, in a virtual machine'
 	@echo 'make bench      seconds and errors of kernels     make chart     speed against accuracy      make stability  where it fails'
 	@echo 'make bench-panorama  what a merged panorama loses of the one that was photographed, and what 24 megapixels take'
@@ -238,4 +282,4 @@ help:
 	@echo 'make bench-develop  raws to radiance: seconds and MB per 24-megapixel frame, 85 of them sustained'
 	@echo 'make install    DESTDIR= PREFIX=/usr/local        make deps      Debian packages             make clean'
 	@echo 'variants: VARIANT=debug|asan|tsan; V=1 shows commands'
--include $(shell find $(BUILD)/obj $(BUILD)/fuzz -name '*.d' 2>/dev/null)
+-include $(shell find $(BUILD)/obj $(BUILD)/fuzz build/firmware -name '*.d' 2>/dev/null)

@@ -99,6 +99,7 @@ char *camera_command_encode(const struct camera_command *c, size_t *n_bytes)
     put_object(doc, "object", &c->object);
     put_string(doc, "path", c->path);
     put_string(doc, "xxh128", c->xxh128);
+    put_string(doc, "judge", c->judge);
     return finish(doc, n_bytes);
 }
 
@@ -162,6 +163,8 @@ char *camera_event_encode(const struct camera_event *e, size_t *n_bytes)
     put_int(doc, "pressed_ns", e->pressed_ns);
     put_int(doc, "size", e->size_bytes);
     put_string(doc, "xxh128", e->xxh128);
+    if (e->judged)
+        json_set(doc, "frame", frame_facts_json(&e->frame));
     put_int(doc, "at_ns", e->at_ns);
     if (e->more)
         json_set_bool(doc, "more", true);
@@ -299,6 +302,7 @@ int camera_command_decode(struct camera_command *out, const char *text, size_t n
     take_string(&r, "path", out->path, sizeof(out->path));
     r.bad |= out->path[0] && out->path[0] != '/';
     take_hex(&r, out->xxh128);
+    take_string(&r, "judge", out->judge, sizeof(out->judge));
     json_free(doc);
     if (r.bad)
         memset(out, 0, sizeof(*out));
@@ -366,6 +370,8 @@ int camera_event_decode(struct camera_event *out, const char *text, size_t n_byt
     out->pressed_ns = take_int(&r, "pressed_ns", 0, INT64_MAX);
     out->size_bytes = take_int(&r, "size", 0, INT64_MAX);
     take_hex(&r, out->xxh128);
+    out->judged = json_get(doc, "frame") != NULL;
+    r.bad |= out->judged && frame_facts_from_json(&out->frame, json_get(doc, "frame"));
     out->at_ns = take_int(&r, "at_ns", 0, INT64_MAX);
     out->more = take_bool(&r, "more");
     out->n_listed = take_length(&r, "objects", CAMERA_LISTING_MAX);

@@ -11,6 +11,7 @@
 //  - Nothing a camera says is trusted: strings are cut, lists bounded, sizes checked against what was read.
 // Paths are absolute. Times are CLOCK_MONOTONIC nanoseconds unless the name says otherwise.
 #pragma once
+#include "rigd/frame_facts.h"
 #include <stdbool.h>
 #include <stddef.h>
 #include <stdint.h>
@@ -22,6 +23,7 @@ enum {
     CAMERA_SETTINGS_MAX = 24, // per camera
     CAMERA_LISTING_MAX = 64,  // objects per answer
     CAMERA_STORES_MAX = 4,    // cards per body
+    CAMERA_LENS_MAX = 640,
 };
 
 // Neutral names ("iso", "shutter", ...: config/cameras/*.conf translates them for a family of bodies).
@@ -48,7 +50,7 @@ enum camera_command_kind {
     CAMERA_LIST,      // refresh the card's listing. n_objects 0: -> the newest object of each store. Else -> up to n_objects
                       // (and CAMERA_LISTING_MAX) in DCF order that are later than after[] of their store, `more` if not all
     CAMERA_FETCH,     // copy object to path: written, hashed, synced, read back, then named -> size, xxh128. A file of the object's
-                      // size that is there already is whole (nothing else gets that name): it is hashed instead
+                      // size that is there already is whole (nothing else gets that name): it is hashed instead. judge: -> frame, too
     CAMERA_THUMBNAIL, // likewise the object's preview (JPEG) -> size, xxh128
     CAMERA_DELETE,    // delete object from the card, after hashing the copy at path once more: it must equal xxh128
     CAMERA_IDENTIFY,  // make the body notice itself for some seconds (live view, beep): a person is looking for it
@@ -78,6 +80,7 @@ struct camera_command {
     struct camera_object object;
     char path[512];     // FETCH, THUMBNAIL: of the copy; nothing is replaced. DELETE: the copy
     char xxh128[33];    // DELETE
+    char judge[CAMERA_LENS_MAX]; // FETCH: what does the frame show through this lens (lens.h's JSON)? "": nobody asks
 };
 
 // What kind of trouble, and with it who can help. Beside it an errno and a sentence for people.
@@ -140,6 +143,8 @@ struct camera_event {
     struct camera_object object[CAMERA_LISTING_MAX]; // LIST; OBJECT: [0]
     int64_t size_bytes;                // FETCH, THUMBNAIL; PROGRESS: so far
     char xxh128[33];                   // FETCH, THUMBNAIL: 32 lower-case hex digits
+    bool judged;                       // FETCH: frame is known (a raw that LibRaw knows, with command.judge)
+    struct frame_facts frame;
     int64_t at_ns;                     // OBJECT: when the camera announced it
 };
 

@@ -160,6 +160,63 @@ static int disk_trouble(struct camera_event *e, int err, const char *path)
     return gphoto_fail(e, CAMERA_DISK, err, "cannot write %.60s: %s: %s", strrchr(path, '/') ? strrchr(path, '/') + 1 : path, strerror(-err), what);
 }
 
+// Unpacks the frame in a process of its own (rigd-unpack, beside this program). 0: whole, or nothing that can be told. -EBADMSG: damaged,
+// and why says what was found. With the command's judge, and where it can be told: what the frame shows, in the answer.
+static int check_pixels(struct worker *w, int fd, char *why, size_t room)
+{
+    const struct camera_command *c = &w->command;
+    const char *dot = strrchr(c->object.name, '.');
+    char program[512], said[4096], lens[CAMERA_LENS_MAX];
+    char *arguments[] = { program, "--judge", lens, "/proc/self/fd/4", NULL }, *plain[] = { program, "/proc/self/fd/4", NULL };
+    struct json *doc = NULL;
+    size_t n_said = 0;
+    int ends[2], status = 0;
+    pid_t child;
+    if (dot && (!strcasecmp(dot, ".jpg") || !strcasecmp(dot, ".jpeg")))
+        return 0;
+    ssize_t n = readlink("/proc/self/exe", program, sizeof(program) - 32);
+    while (n > 0 && program[n - 1] != '/')
+        n--;
+    if (n <= 0 || pipe2(ends, O_CLOEXEC))
+        return 0;
+    strcpy(program + n, "rigd-unpack");
+    memcpy(lens, c->judge, sizeof(lens));
+    const int high = fcntl(fd, F_DUPFD_CLOEXEC, 10), out = fcntl(ends[1], F_DUPFD_CLOEXEC, 10);
+    posix_spawn_file_actions_t actions;
+    posix_spawn_file_actions_init(&actions);
+    posix_spawn_file_actions_adddup2(&actions, out, STDOUT_FILENO);
+    posix_spawn_file_actions_adddup2(&actions, high, 4);
+    posix_spawn_file_actions_addclose(&actions, CAMERA_FD);
+    posix_spawn_file_actions_addclosefrom_np(&actions, 5); // the driver's links to the camera above all
+    const int err = high < 0 || out < 0 ? errno : posix_spawn(&child, program, &actions, NULL, lens[0] ? arguments : plain, environ);
+    posix_spawn_file_actions_destroy(&actions);
+    close(ends[1]);
+    if (high >= 0)
+        close(high);
+    if (out >= 0)
+        close(out);
+    if (err) {
+        log_warning("rigd-camera: cannot start %s: %s: frames are not unpacked", program, strerror(err));
+    } else {
+        while (n_said < sizeof(said) - 1 && ((n = read(ends[0], said + n_said, sizeof(said) - 1 - n_said)) > 0 || (n < 0 && errno == EINTR)))
+            n_said += n > 0 ? (size_t)n : 0;
+        said[n_said] = 0;
+        said[strcspn(said, "\n")] = 0;
+        snprintf(why, room, "%.*s", (int)room - 1, said);
+        while (waitpid(child, &status, 0) < 0 && errno == EINTR)
+            ;
+    }
+    close(ends[0]);
+    if (!err && lens[0] && WIFEXITED(status) && !WEXITSTATUS(status) && !json_parse(&doc, said, strlen(said), "rigd-unpack"))
+        w->answer.judged = !frame_facts_from_json(&w->answer.frame, doc);
+    json_free(doc);
+    if (err || (WIFEXITED(status) && WEXITSTATUS(status) != 1))
+        return 0;
+    if (WIFSIGNALED(status))
+        snprintf(why, room, "unpacking it ended with %s", strsignal(WTERMSIG(status)));
+    return -EBADMSG;
+}
+
 // A copy that a life before made and named, but did not speak of. 1: it is taken over, 0: there is none, < 0: trouble.
 static int adopt(struct worker *w)
 {
@@ -171,54 +228,13 @@ static int adopt(struct worker *w)
     if (!S_ISREG(st.st_mode) || (c->kind == CAMERA_FETCH && c->object.size_bytes > 0 && st.st_size != c->object.size_bytes))
         return disk_trouble(e, -EEXIST, c->path);
     const int err = ingest_adopt(c->path, e->xxh128, &e->size_bytes);
-    return err ? disk_trouble(e, err, c->path) : 1;
-}
-
-// Unpacks the frame in a process of its own (rigd-unpack, beside this program). 0: whole, or nothing that can be told. -EBADMSG: damaged,
-// and why says what was found.
-static int check_pixels(int fd, const char *name, char *why, size_t room)
-{
-    const char *dot = strrchr(name, '.');
-    char program[512], *arguments[] = { program, "/proc/self/fd/4", NULL };
-    int ends[2], status = 0;
-    pid_t child;
-    if (dot && (!strcasecmp(dot, ".jpg") || !strcasecmp(dot, ".jpeg")))
-        return 0;
-    ssize_t n = readlink("/proc/self/exe", program, sizeof(program) - 32);
-    while (n > 0 && program[n - 1] != '/')
-        n--;
-    if (n <= 0 || pipe2(ends, O_CLOEXEC))
-        return 0;
-    strcpy(program + n, "rigd-unpack");
-    const int high = fcntl(fd, F_DUPFD_CLOEXEC, 10), out = fcntl(ends[1], F_DUPFD_CLOEXEC, 10);
-    posix_spawn_file_actions_t actions;
-    posix_spawn_file_actions_init(&actions);
-    posix_spawn_file_actions_adddup2(&actions, out, STDOUT_FILENO);
-    posix_spawn_file_actions_adddup2(&actions, high, 4);
-    posix_spawn_file_actions_addclose(&actions, CAMERA_FD);
-    posix_spawn_file_actions_addclosefrom_np(&actions, 5); // the driver's links to the camera above all
-    const int err = high < 0 || out < 0 ? errno : posix_spawn(&child, program, &actions, NULL, arguments, environ);
-    posix_spawn_file_actions_destroy(&actions);
-    close(ends[1]);
-    if (high >= 0)
-        close(high);
-    if (out >= 0)
-        close(out);
-    if (err) {
-        log_warning("rigd-camera: cannot start %s: %s: frames are not unpacked", program, strerror(err));
-    } else {
-        n = read(ends[0], why, room - 1);
-        why[n > 0 ? n : 0] = 0;
-        why[strcspn(why, "\n")] = 0;
-        while (waitpid(child, &status, 0) < 0 && errno == EINTR)
-            ;
+    const int fd = !err && c->judge[0] ? open(c->path, O_RDONLY | O_CLOEXEC) : -1;
+    if (fd >= 0) {
+        char why[120];
+        check_pixels(w, fd, why, sizeof(why)); // it was whole when it got its name
+        close(fd);
     }
-    close(ends[0]);
-    if (err || (WIFEXITED(status) && WEXITSTATUS(status) != 1))
-        return 0;
-    if (WIFSIGNALED(status))
-        snprintf(why, room, "unpacking it ended with %s", strsignal(WTERMSIG(status)));
-    return -EBADMSG;
+    return err ? disk_trouble(e, err, c->path) : 1;
 }
 
 static int copy_object(struct worker *w)
@@ -241,7 +257,7 @@ static int copy_object(struct worker *w)
     }
     err = container_check(ingest_fd(copy.ingest), copy.size, preview ? "preview.jpg" : c->object.name, why, sizeof(why));
     if (!err && !preview)
-        err = check_pixels(ingest_fd(copy.ingest), c->object.name, why, sizeof(why));
+        err = check_pixels(w, ingest_fd(copy.ingest), why, sizeof(why));
     if (err) {
         ingest_abort(copy.ingest);
         if (err != -EBADMSG)
@@ -330,7 +346,7 @@ static void tidy(struct camera_event *e)
     if (e->kind == CAMERA_FAILED || kind != CAMERA_CONFIGURE)
         e->n_settings = 0;
     if (e->kind == CAMERA_FAILED || (kind != CAMERA_FETCH && kind != CAMERA_THUMBNAIL))
-        e->size_bytes = 0, e->xxh128[0] = 0;
+        e->size_bytes = 0, e->xxh128[0] = 0, e->judged = false;
     e->at_ns = 0;
 }
 

@@ -28,7 +28,7 @@ void colour_free(struct colour *c); // NULL and zeroed allowed
 const struct body_colour *colour_of(const struct colour *c, const char *serial); // NULL: not there
 
 // ---- measuring one frame ----
-// A patch of the card or the chart, in the camera's channels: mean of daylight[c] x (DN - black) / (white - black) x exposure_scale.
+// A patch of the card or the chart, in the camera's channels: mean of flat x daylight[c] x (DN - black) / (white - black) x exposure_scale.
 struct cell {
     double mean[3];
     double raw[3];   // mean of (DN - black) / (white - black): how well it is exposed
@@ -38,8 +38,8 @@ struct cell {
 // corner: upper left, upper right, lower right, lower left of what the cells divide, in pixels of the frame as it lies on the sensor (upper
 // left is the card's, however the camera is turned). Of each cell the middle is measured: share of its width and height.
 // 0; -EINVAL, and why: corners outside the frame or not convex, or cells of fewer than 16 sites per colour.
-int colour_measure(struct cell *out, const struct raw_frame *f, const struct saturation *s, double exposure_scale, const double corner[4][2],
-                   int columns, int rows, double share, char *why, size_t room);
+int colour_measure(struct cell *out, const struct raw_frame *f, const struct saturation *s, const struct flat *flat, double exposure_scale,
+                   const double corner[4][2], int columns, int rows, double share, char *why, size_t room);
 
 // ---- fitting a rig ----
 struct colour_frame {

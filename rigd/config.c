@@ -3,6 +3,8 @@
 // inih cuts long lines and section names without a word and does not tell line numbers to its handler; the reader below feeds it
 // line by line from memory, so that both are known here.
 #include "rigd/config.h"
+#include "rigd/access.h"
+#include "rigd/stops.h"
 #include "solver/take/atomic_file.h"
 #include "solver/take/log.h"
 
@@ -14,9 +16,10 @@
 #include <string.h>
 #include <unistd.h>
 
-enum { LINE_MAX_BYTES = 196, SECTION_MAX_BYTES = 48, FINDINGS_MAX = 20, LINES_MAX = 4096 };
+enum { LINE_MAX_BYTES = 196, SECTION_MAX_BYTES = 48, FINDINGS_MAX = 20, LINES_MAX = 4096,
+       OUTPUTS_MAX = 416, PRESSES_MAX = 256, INPUTS_MAX = 200, STEPS_MAX = 1000000 }; // of the trigger board (firmware/protocol.h)
 
-enum type { TEXT, PATH, INTEGER, UNSIGNED, NUMBER, BOOL, LINE, PORT, POWER, KIND, NAME };
+enum type { TEXT, PATH, INTEGER, UNSIGNED, NUMBER, BOOL, LINE, PORT, POWER, KIND, NAME, HEAD, MODEL, SECONDS, NUMBERS, STOPS, ON_OFF, DEMOSAIC, THEN, LISTEN };
 
 struct key {
     const char *name;
@@ -65,6 +68,42 @@ static const struct key trigger_keys[] = {
     { "half_press_ms", UNSIGNED, FIELD(trigger_config, half_press_ms), 0, 5000, false },
     { "hold_ms", UNSIGNED, FIELD(trigger_config, hold_ms), 1, 10000, false },
     { "max_hold_ms", UNSIGNED, FIELD(trigger_config, max_hold_ms), 1, 10000, false },
+    { "serial", NAME, FIELD(trigger_config, serial), 0, 0, false },
+    { "output_registers", INTEGER, FIELD(trigger_config, output_registers), 1, OUTPUTS_MAX / 8, false },
+    { "head_yaw_steps_per_turn", INTEGER, FIELD(trigger_config, head_steps_per_turn[0]), -STEPS_MAX, STEPS_MAX, false },
+    { "head_pitch_steps_per_turn", INTEGER, FIELD(trigger_config, head_steps_per_turn[1]), -STEPS_MAX, STEPS_MAX, false },
+    { "head_deg_per_s", NUMBER, FIELD(trigger_config, head_deg_per_s), .1, 360, false },
+    { "head_deg_per_s2", NUMBER, FIELD(trigger_config, head_deg_per_s2), .1, 3600, false },
+    { "head_yaw_limit_deg", NUMBER, FIELD(trigger_config, head_limit_deg[0]), 0, 720, false },
+    { "head_pitch_limit_deg", NUMBER, FIELD(trigger_config, head_limit_deg[1]), 0, 180, false },
+    { "head_home_switch", BOOL, FIELD(trigger_config, head_home_switch), 0, 0, false },
+};
+static const struct key web_keys[] = {
+    { "listen", LISTEN, FIELD(config, web.listen), 0, 0, true },
+    { "token_always", BOOL, FIELD(config, web.token_always), 0, 0, false },
+};
+static const struct key develop_keys[] = {
+    { "after", ON_OFF, FIELD(process_config, develop), 0, 0, false },
+    { "demosaic", DEMOSAIC, FIELD(process_config, demosaic), 0, 0, false },
+    { "flat", PATH, FIELD(process_config, flat), 0, 0, false },
+    { "colour", PATH, FIELD(process_config, colour), 0, 0, false },
+    { "jobs", INTEGER, FIELD(process_config, develop_jobs), 0, 256, false },
+    { "memory_mb", UNSIGNED, FIELD(process_config, memory_mb), 0, 1e7, false },
+    { "timeout_s", UNSIGNED, FIELD(process_config, develop_timeout_s), 1, 86400, false },
+    { "panorama_timeout_s", UNSIGNED, FIELD(process_config, panorama_timeout_s), 1, 86400, false },
+};
+static const struct key reconstruct_keys[] = {
+    { "command", TEXT, FIELD(process_config, command), 0, 0, false },
+    { "calibrated", PATH, FIELD(process_config, calibrated), 0, 0, false },
+    { "timeout_s", UNSIGNED, FIELD(process_config, reconstruct_timeout_s), 1, 604800, false },
+};
+static const struct key solve_keys[] = {
+    { "preview", ON_OFF, FIELD(process_config, preview), 0, 0, false },
+    { "then", THEN, FIELD(process_config, then), 0, 0, false },
+    { "options", TEXT, FIELD(process_config, options), 0, 0, false },
+    { "threads", INTEGER, FIELD(process_config, solve_threads), 0, 256, false },
+    { "program", PATH, FIELD(process_config, solve_program), 0, 0, false },
+    { "timeout_s", UNSIGNED, FIELD(process_config, solve_timeout_s), 1, 604800, false },
 };
 static const struct key camera_keys[] = {
     { "serial", NAME, FIELD(config_camera, serial), 0, 0, false },
@@ -78,9 +117,32 @@ static const struct key camera_keys[] = {
     { "relay_line", LINE, FIELD(config_camera, relay_line), 0, 0, false },
     { "power", POWER, FIELD(config_camera, power), 0, 0, false },
 };
+static const struct key panorama_keys[] = {
+    { "camera", NAME, FIELD(config, panorama.camera_name), 0, 0, true },
+    { "head", HEAD, FIELD(config, panorama.head), 0, 0, false },
+    { "lens", MODEL, FIELD(config, panorama.lens.model), 0, 0, true },
+    { "width_px", INTEGER, FIELD(config, panorama.lens.width_px), 2, 65536, true },
+    { "height_px", INTEGER, FIELD(config, panorama.lens.height_px), 2, 65536, true },
+    { "focal_px", NUMBER, FIELD(config, panorama.lens.focal_px), 1, 1e6, true },
+    { "centre_px", NUMBERS, FIELD(config, panorama.lens.centre_px), 0, 65536, false },
+    { "distortion", NUMBERS, FIELD(config, panorama.lens.k), -100, 100, false }, // and p, right behind it
+    { "circle_px", NUMBER, FIELD(config, panorama.lens.circle_px), 0, 65536, false },
+    { "max_angle_deg", NUMBER, FIELD(config, panorama.max_angle_deg), 1, 180, false },
+    { "shading", NUMBERS, FIELD(config, panorama.lens.v), -100, 100, false },
+    { "nodal_offset_m", NUMBER, FIELD(config, panorama.nodal_offset_m), -1, 1, false },
+    { "overlap", NUMBER, FIELD(config, panorama.overlap), 0, .9, false },
+    { "stops", STOPS, FIELD(config, panorama.stop), 0, 0, false },
+    { "meter", SECONDS, FIELD(config, panorama.meter_s), 1e-5, 60, false },
+    { "shortest", SECONDS, FIELD(config, panorama.shortest_s), 1e-5, 60, false },
+    { "longest", SECONDS, FIELD(config, panorama.longest_s), 1e-5, 60, false },
+    { "frames_max", INTEGER, FIELD(config, panorama.frames_max), 2, CONFIG_FRAMES_MAX, false },
+    { "settle_ms", UNSIGNED, FIELD(config, panorama.settle_ms), 0, 60000, false },
+    { "neutral_density_ev", NUMBER, FIELD(config, panorama.neutral_density_ev), 0, 40, false },
+};
+_Static_assert(offsetof(struct lens, p) == offsetof(struct lens, k) + sizeof(((struct lens *)0)->k), "distortion is read as one list");
 #define COUNT(keys) ((int)(sizeof(keys) / sizeof((keys)[0])))
 
-enum section { NO_SECTION, RIG, SETTINGS, CALIBRATION, TRIGGER, CAMERA, BAD_SECTION };
+enum section { NO_SECTION, RIG, SETTINGS, CALIBRATION, TRIGGER, PANORAMA, WEB, DEVELOP, RECONSTRUCT, SOLVE, CAMERA, BAD_SECTION };
 static const struct {
     const char *name;
     const struct key *keys;
@@ -91,6 +153,11 @@ static const struct {
     [SETTINGS] = { "settings", NULL, 0 },
     [CALIBRATION] = { "calibration", calibration_keys, COUNT(calibration_keys) },
     [TRIGGER] = { "trigger", trigger_keys, COUNT(trigger_keys) },
+    [DEVELOP] = { "develop", develop_keys, COUNT(develop_keys) },
+    [RECONSTRUCT] = { "reconstruct", reconstruct_keys, COUNT(reconstruct_keys) },
+    [SOLVE] = { "solve", solve_keys, COUNT(solve_keys) },
+    [PANORAMA] = { "panorama", panorama_keys, COUNT(panorama_keys) },
+    [WEB] = { "web", web_keys, COUNT(web_keys) },
     [CAMERA] = { "camera", camera_keys, COUNT(camera_keys) },
 };
 
@@ -109,7 +176,9 @@ struct reader {
     int section_line;
     uint32_t seen;          // keys of the present section
     uint32_t seen_sections; // except cameras
+    uint32_t trigger_seen;  // keys of [trigger]
     int camera_line[CONFIG_CAMERAS_MAX];
+    int panorama_line;
     int trigger_line, hold_line; // of [trigger]; of the last of half_press_ms, hold_ms and max_hold_ms, else of [trigger]
     struct own_setting *own;
     int n_own;
@@ -117,7 +186,7 @@ struct reader {
 
 __attribute__((format(printf, 3, 4))) static void complain(struct reader *r, int line, const char *format, ...)
 {
-    char text[400];
+    char text[500];
     va_list args;
     if (r->n_findings++ >= FINDINGS_MAX)
         return;
@@ -136,6 +205,7 @@ static void check_section_end(struct reader *r)
 {
     if (r->section == NO_SECTION || r->section == BAD_SECTION)
         return;
+    r->trigger_seen |= r->section == TRIGGER ? r->seen : 0;
     for (int k = 0; k < sections[r->section].n_keys; k++)
         if (sections[r->section].keys[k].required && !(r->seen >> k & 1))
             complain(r, r->section_line, "[%s] has no '%s'; add a line '%s = ...'", sections[r->section].name, sections[r->section].keys[k].name, sections[r->section].keys[k].name);
@@ -194,13 +264,33 @@ static void begin_section(struct reader *r, const char *name)
             r->section = s;
             if (s == TRIGGER)
                 r->trigger_line = r->hold_line = r->line;
+            if (s == DEVELOP) // naming it is asking for it
+                r->config->process.develop = true;
+            if (s == SOLVE) {
+                r->config->process.preview = true;
+                r->config->process.then = SOLVE_THEN_STANDARD;
+            }
+            if (s == PANORAMA)
+                r->panorama_line = r->line;
             if (r->seen_sections >> s & 1)
                 complain(r, r->line, "section [%s] is there twice; join them", name);
             r->seen_sections |= 1u << s;
             return;
         }
-    complain(r, r->line, "found section [%s], expected [rig], [settings], [trigger], [calibration] or [camera \"NAME\"]", name);
+    complain(r, r->line, "found section [%s], expected [rig], [settings], [trigger], [calibration], [panorama], [develop], [reconstruct], [solve], [web] or [camera \"NAME\"]", name);
     r->section = BAD_SECTION;
+}
+
+// In a list of stops a semicolon is a separator; inih takes one after a blank for the beginning of a comment, and would cut it there.
+static void join_stops(char *line)
+{
+    char *to = line;
+    if (strncmp(line, "stops", 5) || !strchr(" \t=:", line[5]))
+        return;
+    for (const char *from = line; *from; from++)
+        if (from[strspn(from, " \t")] != ';' || *from == ';')
+            *to++ = *from;
+    *to = 0;
 }
 
 // inih asks for the next line here.
@@ -251,6 +341,7 @@ static char *next_line(char *out, int room, void *arg)
         complain(r, r->line, "found neither 'key = value', [section] nor ; comment");
         strcpy(out, "\n");
     }
+    join_stops(out);
     return out;
 }
 
@@ -327,9 +418,67 @@ static bool is_port(const char *s)
     return is_port_number(s, digits(s)) && !s[digits(s)];
 }
 
+// "1/8000" or "2.5".
+static bool to_seconds(const char *text, double *out)
+{
+    double below = 1;
+    char above[40];
+    const size_t n = strcspn(text, "/");
+    if (n >= sizeof(above))
+        return false;
+    memcpy(above, text, n);
+    above[n] = 0;
+    if (!to_number(above, out) || (text[n] && !to_number(text + n + 1, &below)) || !(below > 0))
+        return false;
+    *out /= below;
+    return true;
+}
+
+// "1.5, 2, -3": exactly n numbers.
+static bool to_numbers(const char *text, double *out, int n)
+{
+    char word[40];
+    for (int i = 0; i < n; i++) {
+        text += strspn(text, " \t");
+        const size_t length = strcspn(text, ", \t");
+        if (length >= sizeof(word))
+            return false;
+        memcpy(word, text, length);
+        word[length] = 0;
+        text += length + strspn(text + length, " \t");
+        if (!to_number(word, &out[i]) || *text != (i < n - 1 ? ',' : 0))
+            return false;
+        text += *text == ',';
+    }
+    return true;
+}
+
+// "0,0; 90,0; 180,-30". How many, 0: they are none, or too many.
+static int to_stops(const char *text, struct config_stop *out)
+{
+    char word[80];
+    for (int n = 0; n < CONFIG_STOPS_MAX; n++) {
+        double angle[2];
+        const size_t length = strcspn(text, ";");
+        if (length >= sizeof(word))
+            return 0;
+        memcpy(word, text, length);
+        word[length] = 0;
+        if (!to_numbers(word, angle, 2) || angle[0] < -360 || angle[0] > 360 || angle[1] < -90 || angle[1] > 90)
+            return 0;
+        out[n] = (struct config_stop){ angle[0], angle[1] };
+        if (!text[length])
+            return n + 1;
+        text += length + 1;
+    }
+    return 0;
+}
+
 static const char *set_value(const struct key *key, void *target, const char *value) // NULL, or what was expected
 {
     static const char *const kinds[] = { "software", "gpio", "usb", "simulated" };
+    static const char *const demosaics[] = { "ahd", "bilinear", "half" }, *const thens[] = { "off", "standard", "final" };
+    static const char *const heads[] = { "none", "manual", "board" };
     static _Thread_local char range[80];
     char *field = (char *)target + key->offset;
     double n;
@@ -369,6 +518,16 @@ static const char *set_value(const struct key *key, void *target, const char *va
                 return NULL;
             }
         return "software, gpio, usb or simulated";
+    case LISTEN: {
+        struct listen_address address;
+        if (!strcmp(value, "off"))
+            field[0] = 0;
+        else if (strlen(value) < key->room && !listen_parse(&address, value))
+            memcpy(field, value, strlen(value) + 1);
+        else
+            return "ADDRESS:PORT (127.0.0.1:8420, [::1]:8420; 0.0.0.0:8420 for all addresses), or off";
+        return NULL;
+    }
     case BOOL: {
         const bool yes = !strcmp(value, "yes") || !strcmp(value, "true");
         if (!yes && strcmp(value, "no") && strcmp(value, "false"))
@@ -376,10 +535,30 @@ static const char *set_value(const struct key *key, void *target, const char *va
         memcpy(field, &yes, sizeof(yes));
         return NULL;
     }
+    case ON_OFF: {
+        const bool on = !strcmp(value, "on");
+        if (!on && strcmp(value, "off"))
+            return "on or off";
+        memcpy(field, &on, sizeof(on));
+        return NULL;
+    }
+    case DEMOSAIC:
+    case THEN:
+        for (int i = 0; i < 3; i++)
+            if (!strcmp(value, key->type == THEN ? thens[i] : demosaics[i])) {
+                memcpy(field, &(int){ i }, sizeof(int)); // an enum's size
+                return NULL;
+            }
+        return key->type == THEN ? "off, standard or final" : "ahd, bilinear or half";
     case LINE:
         if (!strcmp(value, "none")) {
             const int none = CONFIG_NONE;
             memcpy(field, &none, sizeof(none));
+            return NULL;
+        }
+        if (!strcmp(value, "capture") && !strcmp(key->name, "feedback_line")) {
+            const int capture = CONFIG_CAPTURE;
+            memcpy(field, &capture, sizeof(capture));
             return NULL;
         }
         if (!to_number(value, &n) || n < 0 || n >= LINES_MAX || n != (int)n)
@@ -387,6 +566,45 @@ static const char *set_value(const struct key *key, void *target, const char *va
         const int line = (int)n;
         memcpy(field, &line, sizeof(line));
         return NULL;
+    case HEAD:
+        for (int i = 0; i < 3; i++)
+            if (!strcmp(value, heads[i])) {
+                const enum head_kind head = i;
+                memcpy(field, &head, sizeof(head));
+                return NULL;
+            }
+        return "none, manual or board";
+    case MODEL:
+        for (int i = 0; i < LENS_MODELS; i++)
+            if (!strcmp(value, lens_model_name(i))) {
+                const enum lens_model model = i;
+                memcpy(field, &model, sizeof(model));
+                return NULL;
+            }
+        return "rectilinear, equidistant, equisolid or stereographic";
+    case SECONDS:
+        if (!to_seconds(value, &n) || n < key->least || n > key->most)
+            return "an exposure time such as 1/125 or 2.5, up to 60 s";
+        memcpy(field, &n, sizeof(n));
+        return NULL;
+    case NUMBERS: {
+        double list[5];
+        const int n_list = !strcmp(key->name, "distortion") ? 5 : (int)(key->room / sizeof(double));
+        bool good = to_numbers(value, list, n_list);
+        for (int i = 0; good && i < n_list; i++)
+            good = list[i] >= key->least && list[i] <= key->most;
+        if (!good) {
+            snprintf(range, sizeof(range), "%d numbers from %.0f to %.0f with commas between them", n_list, key->least, key->most);
+            return range;
+        }
+        memcpy(field, list, (size_t)n_list * sizeof(double));
+        return NULL;
+    }
+    case STOPS: {
+        struct panorama_config *panorama = (struct panorama_config *)(field - offsetof(struct panorama_config, stop));
+        panorama->n_stops = to_stops(value, panorama->stop);
+        return panorama->n_stops ? NULL : "up to 64 pairs yaw,pitch in degrees with semicolons between them: 0,0; 120,0; 240,0";
+    }
     case INTEGER:
     case UNSIGNED:
     case NUMBER:
@@ -456,7 +674,8 @@ static int take_line(void *arg, const char *section, const char *name, const cha
         const struct key *key = &sections[r->section].keys[k];
         if (strcmp(key->name, name))
             continue;
-        void *target = r->section == CAMERA ? (void *)&c->camera[c->n_cameras - 1] : r->section == TRIGGER ? (void *)&c->trigger : (void *)c;
+        void *target = r->section == CAMERA ? (void *)&c->camera[c->n_cameras - 1] : r->section == TRIGGER ? (void *)&c->trigger
+                       : r->section >= DEVELOP ? (void *)&c->process : (void *)c;
         if (r->seen >> k & 1)
             complain(r, r->line, "'%s' is there twice in this section; remove one", name);
         r->seen |= 1u << k;
@@ -467,7 +686,7 @@ static int take_line(void *arg, const char *section, const char *name, const cha
             complain(r, r->line, "%s: found '%s', expected %s", name, value, expected);
         return 1;
     }
-    char known[300] = "";
+    char known[400] = "";
     for (int k = 0, n = 0; k < sections[r->section].n_keys && n < (int)sizeof(known) - 30; k++)
         n += snprintf(known + n, sizeof(known) - (size_t)n, "%s%s", k ? ", " : "", sections[r->section].keys[k].name);
     complain(r, r->line, "[%s] knows no '%s'; it knows %s", sections[r->section].name, name, known);
@@ -497,7 +716,7 @@ static void merge_settings(struct reader *r)
             }
 }
 
-// GPIO lines are one row of numbers; a board and the simulated rig have a row for each purpose.
+// GPIO lines are one row of numbers; a board has outputs and inputs, and the simulated rig a row for each purpose.
 struct use {
     int line;
     const char *purpose;
@@ -508,14 +727,52 @@ static void use_line(struct reader *r, struct use *uses, int *n, int line, const
 {
     if (line == CONFIG_NONE)
         return;
-    struct use u = { .line = line, .purpose = r->config->trigger.kind == TRIGGER_GPIO ? "any" : what };
+    const enum trigger_kind kind = r->config->trigger.kind;
+    const bool is_input = !strcmp(what, "feedback_line");
+    struct use u = { .line = line, .purpose = kind == TRIGGER_GPIO ? "any" : kind == TRIGGER_USB ? (is_input ? "input" : "output") : what };
     snprintf(u.what, sizeof(u.what), "%s%.23s%s%s", camera[0] ? "camera " : "", camera, camera[0] ? "'s " : "[trigger] ", what);
     for (int i = 0; i < *n; i++)
         if (uses[i].line == line && !strcmp(uses[i].purpose, u.purpose)) {
-            complain(r, at, "line %d is %s already, it cannot be %s too", line, uses[i].what, u.what);
+            if (line == CONFIG_CAPTURE)
+                complain(r, at, "the capture input is %s already, it cannot be %s too", uses[i].what, u.what);
+            else
+                complain(r, at, "line %d is %s already, it cannot be %s too", line, uses[i].what, u.what);
             return;
         }
     uses[(*n)++] = u;
+    if (line == CONFIG_CAPTURE && kind != TRIGGER_USB)
+        complain(r, at, "%s = capture: only kind = usb has that input", u.what);
+    if (kind != TRIGGER_USB || !r->config->trigger.output_registers)
+        return;
+    const int n_outputs = 8 * r->config->trigger.output_registers;
+    if (is_input && line >= INPUTS_MAX)
+        complain(r, at, "%s: found %d, expected 0 to %d or capture: the board has no more inputs", u.what, line, INPUTS_MAX - 1);
+    else if (!is_input && line >= n_outputs)
+        complain(r, at, "%s: found %d, expected 0 to %d: output_registers = %d is %d outputs", u.what, line, n_outputs - 1, n_outputs / 8, n_outputs);
+    else if (!strcmp(what, "full_line") && line >= PRESSES_MAX)
+        complain(r, at, "%s: found %d, expected 0 to %d: outputs behind these cannot be pressed at a time of their own; half_line and relay_line may", u.what, line, PRESSES_MAX - 1);
+}
+
+static bool is_said(const struct reader *r, const char *trigger_key)
+{
+    for (int k = 0; k < COUNT(trigger_keys); k++)
+        if (!strcmp(trigger_keys[k].name, trigger_key))
+            return r->trigger_seen >> k & 1;
+    return false;
+}
+
+static void check_board(struct reader *r)
+{
+    struct trigger_config *t = &r->config->trigger;
+    if (!t->output_registers)
+        complain(r, r->trigger_line, "[trigger] kind = usb needs 'output_registers = ' with the number of shift registers in the board's chain (8 outputs each)");
+    if (t->button_line != CONFIG_NONE)
+        complain(r, r->trigger_line, "[trigger] kind = usb has a button input of its own; remove button_line");
+    if (t->active_low)
+        complain(r, r->trigger_line, "[trigger] kind = usb presses with a 1 in its registers; remove active_low, and invert behind them if you must");
+    // Its inputs are pulled up: contacts to ground are the rule.
+    t->button_active_low = t->button_active_low || !is_said(r, "button_active_low");
+    t->feedback_active_low = t->feedback_active_low || !is_said(r, "feedback_active_low");
 }
 
 static void check_lines(struct reader *r)
@@ -539,10 +796,12 @@ static void check_lines(struct reader *r)
         use_line(r, uses, &n, k->feedback_line, k->name, "feedback_line", r->camera_line[i]);
         use_line(r, uses, &n, k->relay_line, k->name, "relay_line", r->camera_line[i]);
         half |= t->kind != TRIGGER_SOFTWARE && k->half_line != CONFIG_NONE;
-        if (t->kind == TRIGGER_GPIO && k->full_line == CONFIG_NONE && t->full_line == CONFIG_NONE)
+        if ((t->kind == TRIGGER_GPIO || t->kind == TRIGGER_USB) && k->full_line == CONFIG_NONE && t->full_line == CONFIG_NONE && i != config_panorama_camera(c))
             complain(r, r->camera_line[i], "camera \"%s\" has no full_line and [trigger] has none for all; nothing would press it", k->name);
     }
     free(uses);
+    if (t->kind == TRIGGER_USB)
+        check_board(r);
     if (t->kind == TRIGGER_GPIO && !t->chip[0])
         complain(r, r->trigger_line, "[trigger] kind = gpio needs 'chip = gpiochip0' or another (gpiodetect lists them)");
     if (t->kind == TRIGGER_SIMULATED && !t->address[0])
@@ -570,6 +829,38 @@ static void check_cameras(struct reader *r)
     }
 }
 
+// Its camera, its lens, and where it stops.
+static void check_panorama(struct reader *r)
+{
+    struct config *c = r->config;
+    struct panorama_config *p = &c->panorama;
+    p->camera = CONFIG_NONE;
+    if (!(r->seen_sections >> PANORAMA & 1) || r->n_findings)
+        return;
+    for (int i = 0; i < c->n_cameras; i++)
+        if (!strcmp(c->camera[i].name, p->camera_name))
+            p->camera = i;
+    if (p->camera == CONFIG_NONE)
+        complain(r, r->panorama_line, "[panorama] camera = %s, but there is no [camera \"%s\"]; add it, or name another", p->camera_name, p->camera_name);
+    else if (c->n_cameras == 1)
+        complain(r, r->panorama_line, "[panorama] takes the only camera; ordinary takes need one, too");
+    p->lens.max_angle_rad = p->max_angle_deg * (3.14159265358979323846 / 180);
+    if (!(p->lens.centre_px[0] > 0) && !(p->lens.centre_px[1] > 0))
+        p->lens.centre_px[0] = .5 * p->lens.width_px, p->lens.centre_px[1] = .5 * p->lens.height_px;
+    if (lens_init(&p->lens, r->file)) // says itself what is wrong
+        r->n_findings++;
+    else if (!p->n_stops && p->head == HEAD_NONE)
+        p->n_stops = 1; // straight ahead: it cannot turn
+    else if (!p->n_stops && !(p->n_stops = stops_plan(p->stop, CONFIG_STOPS_MAX, &p->lens, p->overlap)))
+        complain(r, r->panorama_line, "[panorama] would need more than %d stops for the whole sphere; list those you want: stops = YAW,PITCH; ...", CONFIG_STOPS_MAX);
+    if (p->head == HEAD_NONE && p->n_stops > 1)
+        complain(r, r->panorama_line, "[panorama] has %d stops, but head = none cannot turn; head = manual asks a person to", p->n_stops);
+    if (!(p->shortest_s < p->longest_s) || p->meter_s < p->shortest_s || p->meter_s > p->longest_s)
+        complain(r, r->panorama_line, "[panorama] expected shortest <= meter <= longest, and not all the same");
+    if (p->head == HEAD_BOARD && c->trigger.kind != TRIGGER_USB && c->trigger.kind != TRIGGER_SIMULATED)
+        complain(r, r->panorama_line, "[panorama] head = board needs [trigger] kind = usb (or simulated); head = manual works with any");
+}
+
 static void set_defaults(struct config *c)
 {
     strcpy(c->name, "studio");
@@ -587,12 +878,29 @@ static void set_defaults(struct config *c)
     c->fetch_timeout_ms = 120000;
     c->calibration_shots = 30;
     c->lag_max_std_ms = 15;
+    struct panorama_config *p = &c->panorama;
+    p->camera = CONFIG_NONE;
+    p->overlap = .25;
+    p->meter_s = 1. / 60;
+    p->shortest_s = 1. / 8000;
+    p->longest_s = 4;
+    p->frames_max = 12;
+    p->settle_ms = 800;
     struct trigger_config *t = &c->trigger;
     t->full_line = t->half_line = t->button_line = CONFIG_NONE;
     t->button_debounce_ms = 30;
     t->half_press_ms = 500;
     t->hold_ms = 150;
     t->max_hold_ms = 2000;
+    t->head_deg_per_s = 30;
+    t->head_deg_per_s2 = 60;
+    t->head_limit_deg[0] = 180;
+    t->head_limit_deg[1] = 90;
+    struct process_config *made = &c->process;
+    made->develop_timeout_s = 300;
+    made->panorama_timeout_s = 1800;
+    made->reconstruct_timeout_s = 24 * 3600;
+    made->solve_timeout_s = 12 * 3600;
 }
 
 int config_parse(struct config *out, const char *text, size_t n_bytes, const char *name)
@@ -617,6 +925,7 @@ int config_parse(struct config *out, const char *text, size_t n_bytes, const cha
             complain(&r, 0, "section [%s] is missing", sections[s].name);
     check_cameras(&r);
     merge_settings(&r);
+    check_panorama(&r);
     check_lines(&r);
     if (r.no_memory)
         goto fail;

@@ -10,11 +10,15 @@
 #undef LOG_WARNING
 
 #include "rigd/daemon.h"
+#include "rigd/changes.h"
 #include "rigd/control.h"
 #include "rigd/describe.h"
 #include "rigd/doctor.h"
 #include "rigd/manifest.h"
+#include "rigd/products.h"
 #include "rigd/rig.h"
+#include "rigd/web.h"
+#include "rigd/workshop.h"
 #include "solver/take/atomic_file.h"
 #include "solver/take/log.h"
 
@@ -38,7 +42,7 @@
 #include <unistd.h>
 
 #define S INT64_C(1000000000)
-enum { TRIGGER_RETRY_S = 5, WORKERS_END_MS = 1500 };
+enum { TRIGGER_RETRY_S = 5, WORKERS_END_MS = 1500, WAITERS_MAX = 64 };
 
 struct daemon;
 
@@ -59,17 +63,28 @@ struct job {
     char dir[600], id[96]; // of the take, or of all takes
     char *text;
     const struct config *config; // does not change
+    enum take_kind kind;
     struct ledger ledger;
+    struct processing_record *record;
     struct manifest_known *known;
     int n_known;
     char (*paths)[64];
     char (*hashes)[33];
     uint64_t token;
+    int newest; // so many takes
+};
+
+// Somebody waits for what becomes of a take.
+struct waiter {
+    uint64_t token; // 0: free
+    char take[96];
+    bool added, preview; // preview: until that is there, not for all
 };
 
 struct daemon {
     struct config config;
     char takes_dir[300], worker_path[PATH_MAX];
+    char panorama_take[96]; // the newest there is; ""
     bool once, once_started, to_journal, stopping;
     int exit_code;
     struct rig *rig;
@@ -79,7 +94,10 @@ struct daemon {
     const char *trigger_word;
     struct worker *worker;
     sd_event *event;
-    sd_event_source *timer, *trigger_io, *trigger_timer;
+    sd_event_source *timer, *trigger_io, *trigger_timer, *changes_timer;
+    struct changes *changes;
+    int64_t changes_ns; // when they were last told
+    struct web *web;    // NULL: no page
     struct counters counters;
     int64_t take_began_ns;
     // requests that are answered later
@@ -89,6 +107,10 @@ struct daemon {
     int n_unfinished;
     uint64_t resume_token; // of the first
     bool resuming;
+    // what is made of takes
+    struct workshop *workshop;
+    struct waiter waiter[WAITERS_MAX];
+    char once_take[96];
     // disk
     pthread_t disk;
     bool disk_runs;
@@ -121,6 +143,7 @@ static void job_free(struct job *j)
     free(j->known);
     free(j->paths);
     free(j->hashes);
+    free(j->record);
     ledger_free(&j->ledger);
     free(j);
 }
@@ -214,7 +237,7 @@ static void done_space(struct daemon *d, struct job *j)
 
 static void work_create(struct job *j)
 {
-    j->err = j->text ? ledger_create(j->text, j->id, j->dir) : -ENOMEM;
+    j->err = j->text ? ledger_create(j->text, j->kind, j->id, j->dir) : -ENOMEM;
 }
 
 static void work_commit(struct job *j)
@@ -227,11 +250,26 @@ static void done_commit(struct daemon *d, struct job *j)
     rig_committed(d->rig, now_ns(), j->err);
 }
 
+static int write_plan(const char *dir, const char *text)
+{
+    struct atomic_file f;
+    char path[700];
+    snprintf(path, sizeof(path), "%s/panorama/panorama.json", dir);
+    const int err = atomic_file_open(&f, path);
+    if (err)
+        return err;
+    fprintf(f.stream, "%s\n", text); // commit looks at ferror
+    return atomic_file_commit(&f);
+}
+
 static void work_manifest(struct job *j)
 {
     int n_removed = 0;
     ledger_remove_parts(j->dir, &n_removed); // of workers that died: all copying is over
-    j->err = manifest_write(j->dir, j->known, j->n_known, j->value);
+    if (j->text)
+        j->err = write_plan(j->dir, j->text);
+    if (!j->err)
+        j->err = manifest_write(j->dir, j->known, j->n_known, j->value);
 }
 
 static void done_manifest(struct daemon *d, struct job *j)
@@ -481,6 +519,12 @@ static void on_trigger_broken(void *arg, int err)
     sd_event_source_set_enabled(d->trigger_timer, SD_EVENT_ONESHOT);
 }
 
+static void on_head_arrived(void *arg, int err)
+{
+    struct daemon *d = arg;
+    rig_head_arrived(d->rig, now_ns(), err);
+}
+
 static int on_trigger(sd_event_source *source, int fd, uint32_t events, void *arg)
 {
     struct daemon *d = arg;
@@ -494,7 +538,8 @@ static int open_the_trigger(sd_event_source *source, uint64_t usec, void *arg)
     struct daemon *d = arg;
     static const char *const kinds[] = { "software (unsynchronised)", "gpio", "usb", "simulated" };
     (void)usec;
-    d->host = (struct trigger_host){ on_fired, on_feedback, on_button, on_press_camera, on_trigger_broken, d };
+    d->host = (struct trigger_host){ .fired = on_fired, .feedback = on_feedback, .button = on_button, .press_camera = on_press_camera,
+                                      .broken = on_trigger_broken, .head_arrived = on_head_arrived, .arg = d };
     d->trigger_io = sd_event_source_disable_unref(d->trigger_io);
     trigger_close(d->trigger);
     d->trigger = NULL;
@@ -521,7 +566,7 @@ static void fire(struct daemon *d, const struct trigger_shot *shot)
 
 // ---- takes ---------------------------------------------------------------------------------------------------------------------------------
 
-static int capture(struct daemon *d, const char *name, bool without_missing, char *why)
+static int begin_take(struct daemon *d, enum take_kind kind, const char *name, bool without_missing, char *why)
 {
     char plain[41], id[96], created[40], stamp[40];
     const int64_t utc = utc_ms();
@@ -535,9 +580,24 @@ static int capture(struct daemon *d, const char *name, bool without_missing, cha
     strftime(created, sizeof(created), "%Y-%m-%dT%H:%M:%SZ", &tm);
     strftime(stamp, sizeof(stamp), "%Y%m%dT%H%M%S", &tm);
     snprintf(id, sizeof(id), "%s%03d_%s", stamp, (int)(utc % 1000), plain);
-    const struct rig_take take = { .id = id, .name = plain, .created = created, .utc_ms = utc, .takes_dir = d->takes_dir };
-    d->take_began_ns = now_ns();
-    return rig_capture(d->rig, now_ns(), &take, without_missing, why);
+    const struct rig_take take = { .id = id, .name = plain, .created = created, .utc_ms = utc, .takes_dir = d->takes_dir,
+                                   .panorama_take = kind == TAKE_CAPTURE ? d->panorama_take : NULL };
+    const int err = kind == TAKE_PANORAMA ? rig_panorama(d->rig, now_ns(), &take, why) : rig_capture(d->rig, now_ns(), &take, without_missing, why);
+    if (!err)
+        d->take_began_ns = now_ns();
+    return err;
+}
+
+static int capture(struct daemon *d, const char *name, bool without_missing, char *why)
+{
+    return begin_take(d, TAKE_CAPTURE, name, without_missing, why);
+}
+
+// Ids begin with their time.
+static void know_panorama(struct daemon *d, const struct ledger *l)
+{
+    if (l->kind == TAKE_PANORAMA && (l->state == TAKE_VERIFIED || l->state == TAKE_DEVELOPED || l->state == TAKE_SOLVED) && strcmp(l->id, d->panorama_take) > 0)
+        snprintf(d->panorama_take, sizeof(d->panorama_take), "%s", l->id);
 }
 
 static void count_take(struct daemon *d, const struct ledger *l)
@@ -567,16 +627,24 @@ static void take_is_done(struct daemon *d)
     struct json *report = describe_take(l, false);
     const double seconds = 1e-9 * (double)(now_ns() - d->take_began_ns);
     count_take(d, l);
+    know_panorama(d, l);
     json_set_number(report, "seconds", seconds);
     log_info("take %s: %s after %.2f s%s%s", l->id, take_state_name(l->state), seconds, l->reason[0] ? ": " : "", l->reason);
     control_reply(d->control, d->resuming ? d->resume_token : d->take_token, report);
-    control_publish(d->control, "take", describe_take(l, false));
+    struct json *ended = describe_take(l, false);
+    json_set_number(ended, "seconds", seconds);
+    control_publish(d->control, "take", ended);
+    const bool goes_on = l->state == TAKE_VERIFIED && d->config.process.develop;
+    if (goes_on)
+        workshop_add(d->workshop, l->id, &(struct workshop_request){ .again = -1 });
     if (d->resuming) {
         next_unfinished(d);
         return;
     }
     d->take_token = 0;
-    if (d->once) {
+    if (d->once && goes_on) {
+        snprintf(d->once_take, sizeof(d->once_take), "%s", l->id); // ends when that is settled
+    } else if (d->once) {
         d->exit_code = l->state == TAKE_VERIFIED ? 0 : 1;
         sd_event_exit(d->event, 0);
     }
@@ -609,7 +677,7 @@ static void done_reconcile(struct daemon *d, struct job *j)
     if (err)
         snprintf(why, sizeof(why), "its ledger or its frames cannot be read: %s; see the journal", strerror(-err));
     else
-        err = rig_resume(d->rig, now_ns(), &j->ledger, d->takes_dir, why);
+        err = rig_resume(d->rig, now_ns(), &j->ledger, d->takes_dir, d->resume_token != 0, why);
     if (err == -EBUSY) {
         d->resuming = false; // a take came between: later
         return;
@@ -665,6 +733,7 @@ static bool add_unfinished(struct daemon *d, const char *id)
     return true;
 }
 
+// Takes of an earlier life: whose frames are not all here, and whose processing is owed.
 static void find_unfinished(struct daemon *d)
 {
     struct dirent **entries = NULL;
@@ -674,8 +743,11 @@ static void find_unfinished(struct daemon *d)
         struct ledger l;
         take_dir(d, entries[i]->d_name, path, sizeof(path));
         if (entries[i]->d_name[0] != '.' && !ledger_read(&l, path)) {
+            know_panorama(d, &l);
             if (l.state != TAKE_VERIFIED && l.state != TAKE_DEVELOPED && l.state != TAKE_SOLVED && l.state != TAKE_FAILED && !strcmp(l.id, entries[i]->d_name))
                 add_unfinished(d, l.id);
+            else if (l.processing == LEDGER_OWED && l.state != TAKE_FAILED && !strcmp(l.id, entries[i]->d_name))
+                workshop_add(d->workshop, l.id, &(struct workshop_request){ .again = -1 });
             ledger_free(&l);
         }
         free(entries[i]);
@@ -711,6 +783,156 @@ static void keep_lag(struct daemon *d)
     d->lag_token = 0;
 }
 
+// ---- what is made of takes --------------------------------------------------------------------------------------------------------------
+
+static void work_record(struct job *j)
+{
+    char path[700];
+    snprintf(path, sizeof(path), "%s/%s", j->dir, j->id);
+    j->err = products_record(path, j->record);
+    if (!j->err)
+        j->err = ledger_read(&j->ledger, path);
+}
+
+static void done_record(struct daemon *d, struct job *j)
+{
+    if (!j->err)
+        control_publish(d->control, "take", describe_take(&j->ledger, false));
+    workshop_recorded(d->workshop, j->id, j->err);
+}
+
+static void on_record(void *arg, const char *take, const struct processing_record *record)
+{
+    struct daemon *d = arg;
+    struct job *j = new_job(work_record, done_record);
+    j->record = malloc(sizeof(*j->record));
+    if (!j->record)
+        abort();
+    *j->record = *record;
+    snprintf(j->dir, sizeof(j->dir), "%s", d->takes_dir);
+    snprintf(j->id, sizeof(j->id), "%s", take);
+    give(d, j);
+}
+
+static bool preview_is_there(struct daemon *d, const char *take)
+{
+    struct json *o = workshop_describe(d->workshop, take);
+    bool there = false;
+    for (int i = 0; i < json_length(o, "steps"); i++) {
+        char key[40];
+        const char *step = "", *state = "";
+        snprintf(key, sizeof(key), "steps.%d.step", i);
+        json_get_string(o, key, &step);
+        snprintf(key, sizeof(key), "steps.%d.state", i);
+        json_get_string(o, key, &state);
+        if (!strcmp(step, "preview"))
+            there = !strcmp(state, "done") || !strcmp(state, "failed") || !strcmp(state, "missing") || !strcmp(state, "cancelled");
+    }
+    json_free(o);
+    return there;
+}
+
+static struct json *describe_made(struct daemon *d, const char *take)
+{
+    char path[700];
+    struct json *o = workshop_describe(d->workshop, take);
+    if (!o)
+        o = json_new_object();
+    take_dir(d, take, path, sizeof(path));
+    json_set_string(o, "path", path);
+    return o;
+}
+
+static void answer_waiters(struct daemon *d)
+{
+    for (int i = 0; i < WAITERS_MAX; i++) {
+        struct waiter *w = &d->waiter[i];
+        if (!w->token || !w->added || !(workshop_is_settled(d->workshop, w->take) || (w->preview && preview_is_there(d, w->take))))
+            continue;
+        control_reply(d->control, w->token, describe_made(d, w->take));
+        w->token = 0;
+    }
+}
+
+static void on_changed(void *arg, const char *take, enum processing_step step)
+{
+    struct daemon *d = arg;
+    struct json *o = workshop_describe(d->workshop, take), *body = json_new_object();
+    for (int i = 0; i < json_length(o, "steps"); i++) {
+        char key[40];
+        const char *name = "";
+        struct json *copy = NULL;
+        snprintf(key, sizeof(key), "steps.%d", i);
+        const struct json *s = json_get(o, key);
+        json_get_string(s, "step", &name);
+        char *text = strcmp(name, processing_step_name(step)) ? NULL : json_text(s);
+        if (text && !json_parse(&copy, text, strlen(text), NULL))
+            json_set(body, "step", copy);
+        free(text);
+    }
+    json_set_string(body, "take", take);
+    control_publish(d->control, "processing", body);
+    json_free(o);
+}
+
+static void on_progress(void *arg, const char *take, enum processing_step step, const char *line)
+{
+    struct daemon *d = arg;
+    struct json *body = NULL;
+    if (json_parse(&body, line, strlen(line), NULL))
+        return;
+    json_set_string(body, "take", take);
+    json_set_string(body, "step", processing_step_name(step));
+    control_publish(d->control, "progress", body);
+}
+
+static void on_settled(void *arg, const char *take)
+{
+    struct daemon *d = arg;
+    struct json *o = describe_made(d, take);
+    log_info("take %s: settled", take);
+    for (int i = 0; i < json_length(o, "steps"); i++) {
+        char key[40];
+        const char *step = "", *state = "", *text = "";
+        snprintf(key, sizeof(key), "steps.%d", i);
+        const struct json *s = json_get(o, key);
+        json_get_string(s, "step", &step);
+        json_get_string(s, "state", &state);
+        json_get_string(s, "text", &text);
+        if (!strcmp(state, "failed") || !strcmp(state, "missing"))
+            log_warning("take %s: %s %s: %s", take, step, state, text);
+    }
+    control_publish(d->control, "settled", o);
+    if (d->once && !strcmp(d->once_take, take))
+        sd_event_exit(d->event, 0);
+}
+
+static void on_added(void *arg, uint64_t token, const char *take, int err, const char *why)
+{
+    struct daemon *d = arg;
+    bool waits = false;
+    for (int i = 0; token && i < WAITERS_MAX; i++)
+        if (d->waiter[i].token == token) {
+            waits = d->waiter[i].added = !err;
+            if (err)
+                d->waiter[i].token = 0;
+        }
+    if (err && !token)
+        log_error("take %s: cannot be processed: %s", take, why[0] ? why : strerror(-err));
+    else if (err)
+        control_refuse(d->control, token, err == -EBUSY ? "busy" : "failed", why[0] ? why : strerror(-err));
+    else if (token && !waits)
+        control_reply(d->control, token, describe_made(d, take));
+}
+
+static int on_workshop(sd_event_source *source, int fd, uint32_t events, void *arg)
+{
+    struct daemon *d = arg;
+    (void)source, (void)fd, (void)events;
+    workshop_dispatch(d->workshop);
+    return 0;
+}
+
 // ---- requests ----------------------------------------------------------------------------------------------------------------------------
 
 static void refuse(struct daemon *d, uint64_t token, int err, const char *why)
@@ -732,6 +954,31 @@ static void ask_capture(struct daemon *d, uint64_t token, const struct json *req
         refuse(d, token, err, why);
     else
         d->take_token = token;
+}
+
+static void ask_panorama(struct daemon *d, uint64_t token, const struct json *request)
+{
+    const char *name = "panorama";
+    char why[200];
+    json_get_string(request, "name", &name);
+    const int err = d->n_unfinished ? -EBUSY : begin_take(d, TAKE_PANORAMA, name, false, why);
+    if (d->n_unfinished)
+        snprintf(why, sizeof(why), "an unfinished take is being collected; wait for it");
+    if (err)
+        refuse(d, token, err, why);
+    else
+        d->take_token = token;
+}
+
+static void ask_continue(struct daemon *d, uint64_t token, const struct json *request)
+{
+    char why[200];
+    (void)request;
+    const int err = rig_continue(d->rig, now_ns(), why);
+    if (err)
+        refuse(d, token, err, why);
+    else
+        control_reply(d->control, token, json_new_object());
 }
 
 static void ask_preflight(struct daemon *d, uint64_t token, const struct json *request)
@@ -833,10 +1080,30 @@ static void ask_cancel(struct daemon *d, uint64_t token, const struct json *requ
         control_reply(d->control, token, json_new_object());
 }
 
+static struct json *describe_all_but_cameras(struct daemon *d)
+{
+    struct json *o = describe_rig(d->rig, &d->config, d->trigger_word);
+    char refusal[160] = "";
+    if (d->n_unfinished)
+        snprintf(refusal, sizeof(refusal), "an unfinished take is being collected; wait for it");
+    else if (rig_is_busy(d->rig))
+        snprintf(refusal, sizeof(refusal), "the rig is busy (%s); wait for it", take_state_name(rig_state(d->rig)));
+    else if (!d->trigger)
+        snprintf(refusal, sizeof(refusal), "the trigger is %s: check its cable and power; rigctl doctor says more", d->trigger_word);
+    if (refusal[0])
+        json_set_string(o, "refusal", refusal);
+    json_set(o, "processing", workshop_describe_all(d->workshop));
+    if (d->web)
+        json_set_string(o, "page", web_address(d->web));
+    return o;
+}
+
 static void ask_status(struct daemon *d, uint64_t token, const struct json *request)
 {
+    struct json *o = describe_all_but_cameras(d);
     (void)request;
-    control_reply(d->control, token, describe_status(d->rig, &d->config, d->trigger_word));
+    json_set(o, "cameras", describe_cameras(d->rig, &d->config));
+    control_reply(d->control, token, o);
 }
 
 static void ask_metrics(struct daemon *d, uint64_t token, const struct json *request)
@@ -913,7 +1180,7 @@ static void ask_resume(struct daemon *d, uint64_t token, const struct json *requ
 // What only reads the disk is done by its thread, the answer is ready-made.
 static void work_takes(struct job *j)
 {
-    struct json *list = describe_takes(j->dir), *o = json_new_object();
+    struct json *list = describe_takes(j->dir, j->newest), *o = json_new_object();
     json_set(o, "takes", list ? list : json_new_array());
     j->text = json_text(o);
     json_free(o);
@@ -926,8 +1193,15 @@ static void work_report(struct job *j)
     j->err = ledger_read(&j->ledger, path);
     if (j->err)
         return;
-    struct json *o = describe_take(&j->ledger, true);
+    struct json *o = describe_take(&j->ledger, true), *pages = json_new_array();
     json_set_string(o, "path", path);
+    for (int i = 0; i < j->ledger.n_solves; i++) {
+        char page[900];
+        snprintf(page, sizeof(page), "%s/solve/%s/report.html", path, j->ledger.solve[i].name);
+        if (!access(page, R_OK))
+            json_append_string(pages, page);
+    }
+    json_set(o, "pages", pages);
     j->text = json_text(o);
     json_free(o);
 }
@@ -976,8 +1250,11 @@ static struct job *answer_job(struct daemon *d, uint64_t token, void (*work)(str
 
 static void ask_takes(struct daemon *d, uint64_t token, const struct json *request)
 {
-    (void)request;
-    give(d, answer_job(d, token, work_takes));
+    struct job *j = answer_job(d, token, work_takes);
+    int64_t newest = INT_MAX;
+    json_get_int(request, "newest", &newest);
+    j->newest = newest > 0 && newest < INT_MAX ? (int)newest : INT_MAX;
+    give(d, j);
 }
 
 static void ask_take(struct daemon *d, uint64_t token, const struct json *request, void (*work)(struct job *))
@@ -1006,6 +1283,59 @@ static void ask_export(struct daemon *d, uint64_t token, const struct json *requ
         ask_take(d, token, request, work_export);
 }
 
+static void add_for(struct daemon *d, uint64_t token, const char *id, const struct json *request, struct workshop_request r, bool preview)
+{
+    bool wait = false;
+    json_get_bool(request, "wait", &wait);
+    r.token = token;
+    for (int i = 0; wait && i < WAITERS_MAX; i++)
+        if (!d->waiter[i].token) {
+            d->waiter[i] = (struct waiter){ .token = token, .preview = preview };
+            snprintf(d->waiter[i].take, sizeof(d->waiter[i].take), "%s", id);
+            break;
+        }
+    workshop_add(d->workshop, id, &r); // without room for another waiter: answered at once
+}
+
+static void ask_process(struct daemon *d, uint64_t token, const struct json *request)
+{
+    struct workshop_request r = { .again = -1 };
+    const char *again = "";
+    bool cancel = false;
+    char id[96], why[200];
+    json_get_string(request, "again", &again);
+    json_get_bool(request, "cancel", &cancel);
+    if (!take_named(d, token, request, id))
+        return;
+    if (again[0]) {
+        r.again = processing_step_named(again);
+        if (r.again < 0) {
+            snprintf(why, sizeof(why), "no step '%.40s'; there are sheet, develop, panorama, reconstruct, preview, focus, standard, final", again);
+            control_refuse(d->control, token, "refused", why);
+            return;
+        }
+        r.more = 1u << r.again;
+    }
+    if (cancel) {
+        if (workshop_cancel(d->workshop, id))
+            control_refuse(d->control, token, "refused", "nothing of this take is under way");
+        else
+            control_reply(d->control, token, describe_made(d, id));
+        return;
+    }
+    if (!workshop_wanted(d->workshop)) // nothing is configured: what needs no configuration
+        r.more |= 1u << STEP_SHEET | 1u << STEP_DEVELOP | 1u << STEP_PANORAMA | 1u << STEP_FOCUS;
+    add_for(d, token, id, request, r, false);
+}
+
+static void ask_preview(struct daemon *d, uint64_t token, const struct json *request)
+{
+    char id[96];
+    if (take_named(d, token, request, id))
+        add_for(d, token, id, request, (struct workshop_request){ .again = -1, .urgent = true,
+            .more = 1u << STEP_SHEET | 1u << STEP_DEVELOP | 1u << STEP_PANORAMA | 1u << STEP_RECONSTRUCT | 1u << STEP_PREVIEW }, true);
+}
+
 static void ask_doctor(struct daemon *d, uint64_t token, const struct json *request)
 {
     (void)request;
@@ -1020,9 +1350,9 @@ static void on_request(void *arg, uint64_t token, const char *what, const struct
         const char *what;
         void (*ask)(struct daemon *d, uint64_t token, const struct json *request);
     } requests[] = {
-        { "status", ask_status }, { "capture", ask_capture }, { "preflight", ask_preflight }, { "calibrate", ask_calibrate }, { "identify", ask_identify },
+        { "status", ask_status }, { "capture", ask_capture }, { "panorama", ask_panorama }, { "continue", ask_continue }, { "preflight", ask_preflight }, { "calibrate", ask_calibrate }, { "identify", ask_identify },
         { "reinstate", ask_reinstate }, { "cancel", ask_cancel }, { "takes", ask_takes }, { "report", ask_report }, { "resume", ask_resume }, { "export", ask_export },
-        { "doctor", ask_doctor }, { "metrics", ask_metrics },
+        { "doctor", ask_doctor }, { "metrics", ask_metrics }, { "process", ask_process }, { "preview", ask_preview },
     };
     for (size_t i = 0; i < sizeof(requests) / sizeof(requests[0]); i++)
         if (!strcmp(what, requests[i].what)) {
@@ -1030,7 +1360,7 @@ static void on_request(void *arg, uint64_t token, const char *what, const struct
             return;
         }
     struct daemon *d = arg;
-    control_refuse(d->control, token, "unknown", "expected status, capture, preflight, calibrate, identify, reinstate, cancel, takes, report, resume, export, doctor, metrics or subscribe");
+    control_refuse(d->control, token, "unknown", "expected status, capture, panorama, continue, preflight, calibrate, identify, reinstate, cancel, takes, report, resume, process, preview, export, doctor, metrics or subscribe");
 }
 
 static int on_control(sd_event_source *source, int fd, uint32_t events, void *arg)
@@ -1078,6 +1408,7 @@ static void obey(struct daemon *d, const struct rig_action *a)
         return;
     case RIG_CREATE:
         j = new_job(work_create, done_commit);
+        j->kind = l->kind;
         j->text = ledger_text(l);
         snprintf(j->dir, sizeof(j->dir), "%s", d->takes_dir);
         snprintf(j->id, sizeof(j->id), "%s", l->id);
@@ -1099,6 +1430,11 @@ static void obey(struct daemon *d, const struct rig_action *a)
     case RIG_MANIFEST:
         j = new_job(work_manifest, done_manifest);
         know_copies(j, l);
+        if (l->kind == TAKE_PANORAMA) {
+            struct json *plan = describe_plan(l, &d->config);
+            j->text = json_text(plan);
+            json_free(plan);
+        }
         j->value = utc_ms() / 1000;
         take_dir(d, l->id, j->dir, sizeof(j->dir));
         give(d, j);
@@ -1129,7 +1465,47 @@ static void obey(struct daemon *d, const struct rig_action *a)
             control_reply(d->control, d->identify_token[a->camera], json_new_object());
         d->identify_token[a->camera] = 0;
         return;
+    case RIG_HEAD: {
+        const int err = d->trigger ? trigger_head(d->trigger, a->head.yaw_mdeg, a->head.pitch_mdeg) : -ENODEV;
+        if (err)
+            rig_head_arrived(d->rig, now_ns(), err);
+        return;
     }
+    case RIG_PROMPT: {
+        struct json *o = json_new_object();
+        json_set_string(o, "take", l->id);
+        json_set_bool(o, "on", a->on);
+        json_set_string(o, "text", a->text);
+        control_publish(d->control, "prompt", o);
+        if (a->on)
+            log_info("rig: %s", a->text);
+        return;
+    }
+    case RIG_PROGRESS:
+        control_publish(d->control, "panorama", describe_progress(l, &a->progress));
+        return;
+    }
+}
+
+// Those who watch are told what changed, at once or when the last time is CHANGES_EVERY_MS ago.
+static void tell_changes(struct daemon *d)
+{
+    if (!control_has_subscribers(d->control))
+        return;
+    const int64_t now = now_ns(), due = d->changes_ns + CHANGES_EVERY_MS * S / 1000;
+    if (now >= due) {
+        changes_publish(d->changes, d->control, describe_all_but_cameras(d), d->rig, &d->config);
+        d->changes_ns = now;
+    } else {
+        sd_event_source_set_time(d->changes_timer, (uint64_t)(due / 1000 + 1));
+        sd_event_source_set_enabled(d->changes_timer, SD_EVENT_ONESHOT);
+    }
+}
+
+static int on_changes_due(sd_event_source *source, uint64_t usec, void *arg)
+{
+    (void)source, (void)usec, (void)arg; // look_at_rig comes after every event
+    return 0;
 }
 
 // After each event: what the rig wants now, and when it wants to be woken.
@@ -1146,9 +1522,12 @@ static int look_at_rig(sd_event_source *source, void *arg)
         }
         look_for_work(d);
     }
+    workshop_hold(d->workshop, rig_is_busy(d->rig) || d->resuming);
+    answer_waiters(d);
     const int64_t due = rig_deadline_ns(d->rig);
     sd_event_source_set_time(d->timer, due == INT64_MAX ? UINT64_MAX : (uint64_t)(due / 1000 + 1));
     sd_event_source_set_enabled(d->timer, due == INT64_MAX ? SD_EVENT_OFF : SD_EVENT_ONESHOT);
+    tell_changes(d);
     return 0;
 }
 
@@ -1210,9 +1589,13 @@ static int set_up_loop(struct daemon *d)
     if (err >= 0)
         err = sd_event_add_time_relative(d->event, &d->trigger_timer, CLOCK_MONOTONIC, 0, 1, open_the_trigger, d);
     if (err >= 0)
+        err = sd_event_add_time(d->event, &d->changes_timer, CLOCK_MONOTONIC, UINT64_MAX, 1, on_changes_due, d);
+    if (err >= 0)
         err = sd_event_add_io(d->event, NULL, control_fd(d->control), EPOLLIN, on_control, d);
     if (err >= 0)
         err = sd_event_add_io(d->event, NULL, d->finished_fd, EPOLLIN, on_finished, d);
+    if (err >= 0)
+        err = sd_event_add_io(d->event, NULL, workshop_fd(d->workshop), EPOLLIN, on_workshop, d);
     if (err >= 0)
         err = sd_event_add_post(d->event, &post, look_at_rig, d);
     if (post) {
@@ -1253,6 +1636,7 @@ static void end_workers(struct daemon *d)
 
 static void tear_down(struct daemon *d)
 {
+    web_close(d->web);
     end_workers(d);
     sd_event_source_disable_unref(d->trigger_io);
     trigger_close(d->trigger);
@@ -1263,6 +1647,7 @@ static void tear_down(struct daemon *d)
         pthread_mutex_unlock(&d->lock);
         pthread_join(d->disk, NULL);
     }
+    workshop_close(d->workshop); // what it makes is owed
     for (struct job *j = d->finished; j;) {
         struct job *next = j->next;
         job_free(j);
@@ -1271,6 +1656,8 @@ static void tear_down(struct daemon *d)
     control_close(d->control);
     sd_event_source_disable_unref(d->timer);
     sd_event_source_disable_unref(d->trigger_timer);
+    sd_event_source_disable_unref(d->changes_timer);
+    changes_free(d->changes);
     sd_event_unref(d->event);
     if (d->finished_fd >= 0)
         close(d->finished_fd);
@@ -1293,6 +1680,8 @@ static int run(struct daemon *d)
         setrlimit(RLIMIT_NOFILE, &files);
     }
     int err = rig_create(&d->rig, &d->config);
+    if (!err)
+        err = changes_create(&d->changes, d->config.n_cameras);
     if (err)
         return err;
     lag_path(d, path, sizeof(path));
@@ -1309,6 +1698,9 @@ static int run(struct daemon *d)
         err = make_directories(d->takes_dir);
     if (!err)
         err = control_open(&d->control, d->config.socket_path, on_request, d);
+    const struct workshop_host host = { on_record, on_changed, on_progress, on_settled, on_added, d };
+    if (!err)
+        err = workshop_open(&d->workshop, &d->config, d->takes_dir, &host);
     if (!err)
         err = set_up_loop(d);
     if (!err)
@@ -1316,6 +1708,7 @@ static int run(struct daemon *d)
     if (err)
         return err;
     d->disk_runs = true;
+    web_open(&d->web, &d->config); // without it the rig works all the same
     ledger_remove_leftovers(d->takes_dir);
     find_unfinished(d);
     rig_start(d->rig, now_ns());

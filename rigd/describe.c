@@ -1,5 +1,6 @@
 // rigd/describe.c - what clients get to see.
 #include "rigd/describe.h"
+#include "rigd/take_files.h"
 #include "solver/take/log.h"
 
 #include <dirent.h>
@@ -24,7 +25,7 @@ static void put_known(struct json *o, const char *key, int64_t value)
         json_set_int(o, key, value);
 }
 
-static struct json *describe_camera(const struct rig *rig, const struct config *config, int i)
+struct json *describe_camera(const struct rig *rig, const struct config *config, int i)
 {
     const struct rig_camera_view v = rig_camera(rig, i);
     const struct config_camera *c = &config->camera[i];
@@ -56,9 +57,9 @@ static struct json *describe_camera(const struct rig *rig, const struct config *
     return o;
 }
 
-struct json *describe_status(const struct rig *rig, const struct config *config, const char *trigger)
+struct json *describe_rig(const struct rig *rig, const struct config *config, const char *trigger)
 {
-    struct json *o = json_new_object(), *list = json_new_array();
+    struct json *o = json_new_object();
     const struct ledger *l = rig_ledger(rig);
     int n[RIG_QUARANTINED + 1] = { 0 };
     json_set_string(o, "name", config->name);
@@ -66,19 +67,27 @@ struct json *describe_status(const struct rig *rig, const struct config *config,
     json_set_string(o, "state", take_state_name(rig_state(rig)));
     json_set_bool(o, "busy", rig_is_busy(rig));
     put(o, "outcome", rig_outcome(rig));
+    put(o, "prompt", rig_prompt(rig));
     json_set_string(o, "trigger", trigger);
     json_set_string(o, "takes_dir", config->takes_dir);
+    if (config_panorama_camera(config) != CONFIG_NONE)
+        json_set_string(o, "panorama_camera", config->panorama.camera_name);
     if (l)
         json_set(o, "take", describe_take(l, false));
-    for (int i = 0; i < config->n_cameras; i++) {
-        json_append(list, describe_camera(rig, config, i));
+    for (int i = 0; i < config->n_cameras; i++)
         n[rig_camera(rig, i).condition]++;
-    }
     json_set_int(o, "n_cameras", config->n_cameras);
     json_set_int(o, "n_ready", n[RIG_READY]);
     json_set_int(o, "n_quarantined", n[RIG_QUARANTINED]);
-    json_set(o, "cameras", list);
     return o;
+}
+
+struct json *describe_cameras(const struct rig *rig, const struct config *config)
+{
+    struct json *list = json_new_array();
+    for (int i = 0; i < config->n_cameras; i++)
+        json_append(list, describe_camera(rig, config, i));
+    return list;
 }
 
 struct json *describe_findings(const struct rig *rig, const struct config *config)
@@ -124,6 +133,33 @@ struct json *describe_lag(const struct rig *rig, const struct config *config)
     return o;
 }
 
+static struct json *describe_processing(const struct ledger *l)
+{
+    static const char *const words[LEDGER_N_PROCESSING] = { "none", "owed", "settled", "cancelled" };
+    struct json *o = json_new_object(), *notes = json_new_array(), *solves = json_new_array();
+    int n_developed = 0;
+    for (int i = 0; i < l->n_cameras; i++)
+        n_developed += l->camera[i].developed[0] != 0;
+    json_set_string(o, "state", words[l->processing]);
+    json_set_int(o, "n_developed", n_developed);
+    put(o, "panorama_from", l->panorama_from);
+    for (int i = 0; i < l->n_notes; i++)
+        json_append_string(notes, l->process_note[i]);
+    for (int i = 0; i < l->n_solves; i++) {
+        struct json *e = json_new_object();
+        json_set_string(e, "name", l->solve[i].name);
+        json_set_bool(e, "trusted", l->solve[i].trusted);
+        if (!isnan(l->solve[i].rmse_held_out_percent))
+            json_set_number(e, "rmse_held_out_percent", l->solve[i].rmse_held_out_percent);
+        json_set_number(e, "seconds", l->solve[i].seconds);
+        put(e, "why", l->solve[i].why);
+        json_append(solves, e);
+    }
+    json_set(o, "notes", notes);
+    json_set(o, "solves", solves);
+    return o;
+}
+
 struct json *describe_take(const struct ledger *l, bool with_cameras)
 {
     struct json *o = json_new_object(), *list = json_new_array(), *missing = json_new_array(), *left_out = json_new_array();
@@ -138,7 +174,7 @@ struct json *describe_take(const struct ledger *l, bool with_cameras)
                 n_frames++;
                 bytes += c->object[k].object.size_bytes;
             }
-        if (!c->expected || c->debt == DEBT_MISSED) {
+        if (!c->expected ? c->note[0] : c->debt == DEBT_MISSED) { // without a note: no part of this take
             struct json *e = json_new_object();
             json_set_string(e, "camera", c->name);
             json_set_string(e, "port", c->port);
@@ -151,6 +187,10 @@ struct json *describe_take(const struct ledger *l, bool with_cameras)
         json_set_string(e, "camera", c->name);
         put(e, "serial", c->serial);
         put(e, "note", c->note);
+        if (c->is_exposure) {
+            json_set_int(e, "stop", c->exposure.stop + 1);
+            json_set_string(e, "exposure", c->exposure.label);
+        }
         json_set_int(e, "delay_us", c->delay_us);
         if (c->lag_ns != INT64_MIN)
             json_set_number(e, "lag_ms", 1e-6 * (double)c->lag_ns);
@@ -163,6 +203,11 @@ struct json *describe_take(const struct ledger *l, bool with_cameras)
             json_append(files, f);
         }
         json_set(e, "files", files);
+        if (c->developed[0]) {
+            json_set_string(e, "developed", c->developed);
+            json_set_number(e, "clipped_share", c->clipped_share);
+            json_set_number(e, "developed_s", c->developed_s);
+        }
         json_append(list, e);
     }
     json_set_string(o, "id", l->id);
@@ -170,6 +215,10 @@ struct json *describe_take(const struct ledger *l, bool with_cameras)
     json_set_string(o, "created", l->created);
     json_set_string(o, "state", take_state_name(l->state));
     put(o, "reason", l->reason);
+    json_set_string(o, "kind", l->kind == TAKE_PANORAMA ? "panorama" : "capture");
+    if (l->kind == TAKE_PANORAMA)
+        json_set_int(o, "n_stops", l->n_stops);
+    put(o, "panorama_take", l->panorama_take);
     json_set_int(o, "n_expected", n_expected);
     json_set_int(o, "n_delivered", n_paid);
     json_set_int(o, "n_frames", n_frames);
@@ -184,6 +233,8 @@ struct json *describe_take(const struct ledger *l, bool with_cameras)
         json_set_number(o, "jitter_ms", 1e-6 * (double)l->jitter_ns);
     json_set(o, "missing", missing);
     json_set(o, "left_out", left_out);
+    if (l->processing)
+        json_set(o, "processing", describe_processing(l));
     if (with_cameras)
         json_set(o, "cameras", list);
     else
@@ -191,26 +242,90 @@ struct json *describe_take(const struct ledger *l, bool with_cameras)
     return o;
 }
 
-struct json *describe_takes(const char *takes_dir)
+struct json *describe_plan(const struct ledger *l, const struct config *config)
+{
+    const struct panorama_config *p = &config->panorama;
+    struct json *o = json_new_object(), *stops = json_new_array();
+    json_set_string(o, "take", l->id);
+    json_set_string(o, "state", take_state_name(l->state));
+    put(o, "reason", l->reason);
+    json_set(o, "lens", lens_json(&p->lens));
+    json_set_number(o, "nodal_offset_m", p->nodal_offset_m);
+    json_set_number(o, "neutral_density_ev", p->neutral_density_ev);
+    for (int i = 0; i < l->n_stops; i++) {
+        struct json *stop = json_new_object(), *frames = json_new_array();
+        const char *note = "";
+        char name[16];
+        snprintf(name, sizeof(name), "%02d", i);
+        json_set_string(stop, "name", name);
+        json_set_number(stop, "yaw_deg", l->stop[i].yaw_deg);
+        json_set_number(stop, "pitch_deg", l->stop[i].pitch_deg);
+        for (int k = 0; k < l->n_cameras; k++) {
+            const struct ledger_camera *c = &l->camera[k];
+            const struct ledger_exposure *x = &c->exposure;
+            if (x->stop != i || x->object < 0 || x->rejected || c->debt != DEBT_PAID)
+                continue;
+            struct json *frame = json_new_object();
+            json_set_string(frame, "file", c->object[x->object].file + strlen("panorama/"));
+            json_set_number(frame, "exposure_s", x->facts.light.exposure_s);
+            json_append(frames, frame);
+            note = c->note[0] ? c->note : note;
+        }
+        put(stop, "note", note);
+        json_set(stop, "frames", frames);
+        json_append(stops, stop);
+    }
+    json_set(o, "stops", stops);
+    return o;
+}
+
+struct json *describe_progress(const struct ledger *l, const struct rig_progress *p)
+{
+    static const char *const steps[] = { "turn", "expose", "frame", "stop_done" };
+    struct json *o = json_new_object();
+    json_set_string(o, "take", l->id);
+    json_set_string(o, "step", steps[p->step]);
+    json_set_int(o, "stop", p->stop + 1);
+    json_set_int(o, "n_stops", p->n_stops);
+    json_set_number(o, "yaw_deg", p->yaw_deg);
+    json_set_number(o, "pitch_deg", p->pitch_deg);
+    if (p->step == RIG_STEP_EXPOSE || p->step == RIG_STEP_FRAME) {
+        json_set_int(o, "frame", p->bracket + 1);
+        json_set_string(o, "exposure", p->label);
+    }
+    put(o, "text", p->text);
+    return o;
+}
+
+struct json *describe_takes(const char *takes_dir, int newest)
 {
     struct dirent **entries = NULL;
+    struct json **takes = NULL, *list = NULL;
+    int n_takes = 0;
     const int n = scandir(takes_dir, &entries, NULL, alphasort);
     if (n < 0 && errno != ENOENT) {
         log_error("takes: cannot list %s: %s", takes_dir, strerror(errno));
         return NULL;
     }
-    struct json *list = json_new_array();
-    for (int i = 0; i < n; i++) {
+    takes = calloc((size_t)(n > 0 ? n : 1), sizeof(*takes));
+    for (int i = n - 1; takes && i >= 0 && n_takes < newest; i--) {
         char path[600];
         struct ledger l;
         snprintf(path, sizeof(path), "%s/%s", takes_dir, entries[i]->d_name);
-        if (entries[i]->d_name[0] != '.' && !ledger_read(&l, path)) {
-            json_append(list, describe_take(&l, false));
-            ledger_free(&l);
-        }
-        free(entries[i]);
+        if (entries[i]->d_name[0] == '.' || ledger_read(&l, path))
+            continue;
+        takes[n_takes] = describe_take(&l, false);
+        json_set(takes[n_takes++], "files", take_files_list(path));
+        ledger_free(&l);
     }
+    if (takes)
+        list = json_new_array();
+    for (int i = n_takes - 1; i >= 0; i--)
+        json_append(list, takes[i]);
+    for (int i = 0; i < n; i++)
+        free(entries[i]);
     free(entries);
+    free(takes);
     return list;
 }
 

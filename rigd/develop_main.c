@@ -5,6 +5,7 @@
 // 1 failed, 2 usage, 3 done but not to be trusted (warnings say why).
 #include "rigd/colour.h"
 #include "rigd/develop.h"
+#include "rigd/develop_options.h"
 #include "rigd/digest.h"
 #include "rigd/linear.h"
 #include "solver/take/image.h"
@@ -67,42 +68,17 @@ static const struct argp_option options[] = {
     { 0 },
 };
 
-// n numbers with commas; "1/128" is one. false: it is not so.
-static bool parse_numbers(const char *text, double *to, int n)
-{
-    for (int i = 0; i < n; i++) {
-        char *end;
-        to[i] = strtod(text, &end);
-        if (end == text || !isfinite(to[i]))
-            return false;
-        if (*end == '/') {
-            text = end + 1;
-            const double below = strtod(text, &end);
-            if (end == text || !(below > 0))
-                return false;
-            to[i] /= below;
-        }
-        if (*end != (i + 1 < n ? ',' : 0))
-            return false;
-        text = end + 1;
-    }
-    return true;
-}
-
 static void parse_exposure(struct argp_state *state, const char *option, const char *text, struct exposure *to, bool zero_allowed)
 {
     double v[3];
-    const bool ok = parse_numbers(text, v, 3);
-    for (int i = 0; i < 3; i++)
-        if (!ok || !(v[i] > 0 || (v[i] == 0 && zero_allowed)))
-            argp_error(state, "%s: found '%s'; expected seconds, f-number and ISO such as 1/128,8,100", option, text);
+    if (!option_exposure(text, v, zero_allowed))
+        argp_error(state, "%s: found '%s'; expected seconds, f-number and ISO such as 1/128,8,100", option, text);
     *to = (struct exposure){ v[0], v[1], v[2] };
 }
 
 static error_t parse_option(int key, char *text, struct argp_state *state)
 {
     struct arguments *a = state->input;
-    double v[4];
     switch (key) {
     case OPTION_HALF:
     case OPTION_BILINEAR:
@@ -127,23 +103,19 @@ static error_t parse_option(int key, char *text, struct argp_state *state)
         parse_exposure(state, "--exposure", text, &a->given, true);
         return 0;
     case OPTION_SATURATION:
-        if (!parse_numbers(text, &a->saturation, 1) || !(a->saturation >= 1 && a->saturation <= 65535))
+        if (!option_saturation(text, &a->saturation))
             argp_error(state, "--saturation: found '%s'; expected 1 to 65535", text);
         return 0;
     case OPTION_IF_CHANGED:
         a->if_changed = true;
         return 0;
     case OPTION_PATCH:
-        if (!parse_numbers(text, v, 4) || !(v[2] > 0 && v[3] > 0))
+        if (!option_patch(text, a->corner))
             argp_error(state, "--patch: found '%s'; expected X,Y,W,H", text);
-        for (int i = 0; i < 4; i++) {
-            a->corner[i][0] = v[0] + (i == 1 || i == 2 ? v[2] : 0);
-            a->corner[i][1] = v[1] + (i >= 2 ? v[3] : 0);
-        }
         a->measure = true, a->columns = CARD_COLUMNS, a->rows = CARD_ROWS;
         return 0;
     case OPTION_CHART:
-        if (!parse_numbers(text, a->corner[0], 8))
+        if (!option_chart(text, a->corner))
             argp_error(state, "--chart: found '%s'; expected the x,y of four corners", text);
         a->measure = true, a->columns = CHART_COLUMNS, a->rows = CHART_ROWS;
         return 0;
@@ -531,9 +503,17 @@ static int write_exr(struct job *j)
     return err ? fail(j, err, "%s was not written", j->a.out) : 0;
 }
 
+static bool is_same_file(const char *a, const char *b)
+{
+    struct stat one, other;
+    return !stat(a, &one) && !stat(b, &other) && one.st_dev == other.st_dev && one.st_ino == other.st_ino;
+}
+
 static int develop(struct job *j)
 {
     struct stat st;
+    if (is_same_file(j->a.raw, j->a.out) || (j->a.tiff && is_same_file(j->a.raw, j->tiff_path)))
+        return fail(j, -EINVAL, "its picture would take its place: choose another OUT");
     json_set_string(j->result, "out", j->a.out);
     json_set_string(j->result, "demosaic", demosaic_names[j->a.demosaic]);
     if (j->a.tiff)
@@ -543,8 +523,9 @@ static int develop(struct job *j)
         err = say_what_is_made(j);
     if (err)
         return err;
-    json_set_bool(j->result, "skipped", is_made(j));
-    if (is_made(j))
+    const bool skipped = is_made(j);
+    json_set_bool(j->result, "skipped", skipped);
+    if (skipped)
         return 0;
     lap(j, "hash");
     if (j->a.tiff)
@@ -565,10 +546,14 @@ static int measure(struct job *j)
     char why[WHY_BYTES] = "";
     struct cell cell[COLOUR_CELLS_MAX];
     const double share = j->a.columns == CHART_COLUMNS ? .5 : 1; // a chart has borders
-    int err = read_sites(j);
+    int err = choose_flat(j);
+    if (!err)
+        err = read_flat(j);
+    if (!err)
+        err = read_sites(j);
     if (err)
         return err;
-    err = colour_measure(cell, &j->frame, &j->saturation, j->scale, j->a.corner, j->a.columns, j->a.rows, share, why, sizeof(why));
+    err = colour_measure(cell, &j->frame, &j->saturation, j->flat, j->scale, j->a.corner, j->a.columns, j->a.rows, share, why, sizeof(why));
     if (err)
         return fail(j, err, "%s", why);
     struct json *list = json_new_array();

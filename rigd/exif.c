@@ -164,7 +164,7 @@ static bool read_directory(struct exif *out, const struct tiff *t, int64_t at, i
 // A TIFF's four bytes: "II*\0", "MM\0*", and the other numbers that Olympus and Panasonic write there.
 static bool is_tiff(const uint8_t *p)
 {
-    return (p[0] == 'I' && p[1] == 'I' && (p[2] == 42 || p[2] == 'U' || p[2] == 'R')) || (p[0] == 'M' && p[1] == 'M' && (p[3] == 42 || p[3] == 'O'));
+    return (p[0] == 'I' && p[1] == 'I' && (p[2] == 42 || p[2] == 'U' || p[2] == 'R')) || (p[0] == 'M' && p[1] == 'M' && (p[3] == 42 || p[2] == 'O'));
 }
 
 static bool read_tiff(struct exif *out, struct tiff t, int64_t *subsec_ns)

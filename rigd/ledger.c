@@ -13,6 +13,7 @@
 #include <dirent.h>
 #include <errno.h>
 #include <fcntl.h>
+#include <math.h>
 #include <stdio.h>
 #include <stdlib.h>
 #include <string.h>
@@ -21,11 +22,15 @@
 
 #define FORMAT "studiorig take 1"
 
+enum { ENTRIES_MAX = 4 * CONFIG_CAMERAS_MAX };
+
 static const char *const state_names[TAKE_N_STATES] = {
     "idle", "preflight", "armed", "exposing", "collecting", "verified", "developed", "solved", "failed",
 };
+static const char *const kind_names[TAKE_N_KINDS] = { "capture", "panorama" };
 static const char *const object_states[OBJECT_N_STATES] = { "found", "copied", "deleted", "gone" };
 static const char *const debts[] = { "open", "paid", "missed" };
+static const char *const processings[LEDGER_N_PROCESSING] = { "none", "owed", "settled", "cancelled" };
 
 const char *take_state_name(enum take_state s)
 {
@@ -36,7 +41,8 @@ const char *take_state_name(enum take_state s)
 
 void ledger_init(struct ledger *l, const struct config *config)
 {
-    *l = (struct ledger){ .objects_per_shot = config->objects_per_shot, .spread_ns = -1, .sigma_ns = -1, .jitter_ns = -1 };
+    *l = (struct ledger){ .objects_per_shot = config->objects_per_shot, .spread_ns = -1, .sigma_ns = -1, .jitter_ns = -1,
+                          .processing = config->process.develop ? LEDGER_OWED : LEDGER_UNPROCESSED };
     l->camera = calloc((size_t)config->n_cameras + 1, sizeof(*l->camera));
     if (!l->camera)
         return;
@@ -47,9 +53,52 @@ void ledger_init(struct ledger *l, const struct config *config)
         memcpy(c->port, config->camera[i].port, sizeof(c->port));
         memcpy(c->serial, config->camera[i].serial, sizeof(c->serial));
         c->battery_percent = -1;
-        c->expected = true;
+        c->expected = i != config_panorama_camera(config);
         c->lag_ns = INT64_MIN;
     }
+}
+
+void ledger_init_panorama(struct ledger *l, const struct config *config)
+{
+    *l = (struct ledger){ .kind = TAKE_PANORAMA, .objects_per_shot = 1, .spread_ns = -1, .sigma_ns = -1, .jitter_ns = -1,
+                          .processing = config->process.develop ? LEDGER_OWED : LEDGER_UNPROCESSED };
+    l->n_stops = config->panorama.n_stops;
+    memcpy(l->stop, config->panorama.stop, sizeof(l->stop));
+}
+
+double ledger_exposure_label(double seconds, char label[16])
+{
+    // As dials have them; the shutter's times are 2^(third / 3) s.
+    static const char *const labels[] = { "1/8000", "1/6400", "1/5000", "1/4000", "1/3200", "1/2500", "1/2000", "1/1600", "1/1250", "1/1000", "1/800", "1/640",
+        "1/500", "1/400", "1/320", "1/250", "1/200", "1/160", "1/125", "1/100", "1/80", "1/60", "1/50", "1/40", "1/30", "1/25", "1/20", "1/15", "1/13", "1/10", "1/8",
+        "1/6", "1/5", "1/4", "0.3", "0.4", "0.5", "0.6", "0.8", "1", "1.3", "1.6", "2", "2.5", "3", "4", "5", "6", "8", "10", "13", "15", "20", "25", "30" };
+    enum { N_LABELS = sizeof(labels) / sizeof(labels[0]), FIRST = -39 }; // 2^-13 s is called 1/8000
+    double third = round(3 * log2(seconds));
+    third = third < FIRST ? FIRST : third > FIRST + N_LABELS - 1 ? FIRST + N_LABELS - 1 : third;
+    snprintf(label, 16, "%s", labels[(int)third - FIRST]);
+    return exp2(third / 3);
+}
+
+int ledger_expose(struct ledger *l, const struct config *config, int stop, int bracket, double wanted_s)
+{
+    const struct config_camera *k = &config->camera[config->panorama.camera];
+    if (l->n_cameras == ENTRIES_MAX)
+        return -EFBIG;
+    struct ledger_camera *grown = realloc(l->camera, ((size_t)l->n_cameras + 1) * sizeof(*grown));
+    if (!grown)
+        return -ENOMEM;
+    l->camera = grown;
+    struct ledger_camera *c = &l->camera[l->n_cameras];
+    memset(c, 0, sizeof(*c));
+    snprintf(c->name, sizeof(c->name), "%02d_%02d", stop, bracket);
+    memcpy(c->port, k->port, sizeof(c->port));
+    memcpy(c->serial, k->serial, sizeof(c->serial));
+    c->battery_percent = -1;
+    c->expected = c->is_exposure = true;
+    c->lag_ns = INT64_MIN;
+    c->exposure = (struct ledger_exposure){ .stop = stop, .bracket = bracket, .yaw_deg = l->stop[stop].yaw_deg, .pitch_deg = l->stop[stop].pitch_deg, .object = -1 };
+    c->exposure.wanted_s = ledger_exposure_label(wanted_s, c->exposure.label);
+    return l->n_cameras++;
 }
 
 void ledger_free(struct ledger *l)
@@ -92,10 +141,11 @@ struct ledger_object *ledger_add(struct ledger_camera *c, const struct camera_ob
     *added = (struct ledger_object){ .object = *o, .state = OBJECT_FOUND, .copied_ms = -1 };
     for (int n = 1;; n++) {
         bool taken = false;
+        const char *folder = c->is_exposure ? "panorama/raw" : "raw";
         if (n == 1)
-            snprintf(added->file, sizeof(added->file), "raw/%.23s%s", name, extension);
+            snprintf(added->file, sizeof(added->file), "%s/%.23s%s", folder, name, extension);
         else
-            snprintf(added->file, sizeof(added->file), "raw/%.23s_%d%s", name, n, extension);
+            snprintf(added->file, sizeof(added->file), "%s/%.23s_%d%s", folder, name, n, extension);
         for (int i = 0; i < c->n_objects; i++)
             taken |= !strcmp(c->object[i].file, added->file);
         if (!taken)
@@ -136,6 +186,24 @@ static struct json *object_json(const struct camera_object *o)
     json_set_string(v, "folder", o->folder);
     json_set_string(v, "name", o->name);
     json_set_int(v, "size", o->size_bytes);
+    return v;
+}
+
+static struct json *exposure_json(const struct ledger_exposure *e)
+{
+    struct json *v = json_new_object();
+    json_set_int(v, "stop", e->stop);
+    json_set_int(v, "bracket", e->bracket);
+    json_set_number(v, "yaw_deg", e->yaw_deg);
+    json_set_number(v, "pitch_deg", e->pitch_deg);
+    json_set_number(v, "wanted_s", e->wanted_s);
+    json_set_string(v, "label", e->label);
+    if (e->rejected)
+        json_set_bool(v, "rejected", true);
+    if (e->object >= 0) {
+        json_set_int(v, "object", e->object);
+        json_set(v, "facts", frame_facts_json(&e->facts));
+    }
     return v;
 }
 
@@ -182,6 +250,37 @@ static struct json *camera_json(const struct ledger_camera *c)
         json_append(list, s);
     }
     json_set(v, "settings", list);
+    if (c->is_exposure)
+        json_set(v, "exposure", exposure_json(&c->exposure));
+    if (c->developed[0]) {
+        struct json *d = json_new_object();
+        json_set_string(d, "file", c->developed);
+        json_set_number(d, "clipped_share", c->clipped_share);
+        json_set_number(d, "seconds", c->developed_s);
+        json_set(v, "developed", d);
+    }
+    return v;
+}
+
+static struct json *processing_json(const struct ledger *l)
+{
+    struct json *v = json_new_object(), *notes = json_new_array(), *solves = json_new_array();
+    json_set_string(v, "state", processings[l->processing]);
+    put(v, "panorama_from", l->panorama_from);
+    for (int i = 0; i < l->n_notes; i++)
+        json_append_string(notes, l->process_note[i]);
+    for (int i = 0; i < l->n_solves; i++) {
+        const struct ledger_solve *s = &l->solve[i];
+        struct json *o = json_new_object();
+        json_set_string(o, "name", s->name);
+        json_set_bool(o, "trusted", s->trusted);
+        json_set_number(o, "rmse_held_out_percent", s->rmse_held_out_percent); // not held out: null
+        json_set_number(o, "seconds", s->seconds);
+        put(o, "why", s->why);
+        json_append(solves, o);
+    }
+    json_set(v, "notes", notes);
+    json_set(v, "solves", solves);
     return v;
 }
 
@@ -193,6 +292,18 @@ char *ledger_text(const struct ledger *l)
     json_set_string(doc, "created", l->created);
     json_set_string(doc, "state", take_state_name(l->state));
     json_set_string(doc, "id", l->id);
+    json_set_string(doc, "kind", kind_names[l->kind]);
+    put(doc, "panorama_take", l->panorama_take);
+    if (l->kind == TAKE_PANORAMA) {
+        struct json *stops = json_new_array();
+        for (int i = 0; i < l->n_stops; i++) {
+            struct json *stop = json_new_object();
+            json_set_number(stop, "yaw_deg", l->stop[i].yaw_deg);
+            json_set_number(stop, "pitch_deg", l->stop[i].pitch_deg);
+            json_append(stops, stop);
+        }
+        json_set(doc, "stops", stops);
+    }
     put(doc, "reason", l->reason);
     json_set_string(doc, "rigd", STUDIORIG_VERSION);
     json_set_int(doc, "objects_per_shot", l->objects_per_shot);
@@ -203,6 +314,8 @@ char *ledger_text(const struct ledger *l)
     json_set_int(shot, "n_measured", l->n_measured);
     json_set_int(shot, "jitter_ns", l->jitter_ns);
     json_set(doc, "shot", shot);
+    if (l->processing)
+        json_set(doc, "processing", processing_json(l));
     for (int i = 0; i < l->n_cameras; i++)
         json_append(list, camera_json(&l->camera[i]));
     json_set(doc, "cameras", list);
@@ -281,6 +394,15 @@ static int get_length(struct reader *r, const char *key, int most)
     return n;
 }
 
+static double get_number(struct reader *r, const char *key, double missing)
+{
+    double n = missing;
+    const int err = json_get_number(r->v, key, &n);
+    if (err && err != -ENOENT && !(isnan(missing) && json_get(r->v, key))) // null is a number that is not there
+        complain(r, key, "a number");
+    return err ? missing : n;
+}
+
 static struct reader child(const struct reader *parent, const char *list, int i)
 {
     char key[40];
@@ -303,6 +425,88 @@ static void get_object(struct reader *r, struct camera_object *o)
     o->size_bytes = get_int(r, "size", -1, INT64_MAX, -1);
     if (o->folder[0] != '/' || !o->name[0] || strchr(o->name, '/') || o->name[0] == '.')
         complain(r, "name", "a file on a card");
+}
+
+static void get_developed(struct reader *r, struct ledger_camera *c)
+{
+    struct reader d = { .v = json_get(r->v, "developed"), .file = r->file };
+    snprintf(d.where, sizeof(d.where), "%.25s.developed", r->where);
+    if (!d.v)
+        return;
+    get_string(&d, "file", c->developed, sizeof(c->developed));
+    c->clipped_share = get_number(&d, "clipped_share", 0);
+    c->developed_s = get_number(&d, "seconds", 0);
+    if (strncmp(c->developed, "linear/", 7) || c->developed[7] == '.' || strchr(c->developed + 7, '/'))
+        complain(&d, "file", "a file of linear/");
+    r->bad |= d.bad;
+}
+
+static void get_processing(struct reader *r, struct ledger *l)
+{
+    struct reader p = { .v = json_get(r->v, "processing"), .file = r->file, .where = "processing" };
+    if (!p.v)
+        return;
+    l->processing = get_word(&p, "state", processings, LEDGER_N_PROCESSING);
+    get_string(&p, "panorama_from", l->panorama_from, sizeof(l->panorama_from));
+    l->n_notes = get_length(&p, "notes", LEDGER_NOTES_MAX);
+    for (int i = 0; i < l->n_notes; i++) {
+        char key[20];
+        snprintf(key, sizeof(key), "notes.%d", i);
+        get_string(&p, key, l->process_note[i], sizeof(l->process_note[i]));
+    }
+    l->n_solves = get_length(&p, "solves", LEDGER_SOLVES_MAX);
+    for (int i = 0; i < l->n_solves; i++) {
+        struct ledger_solve *s = &l->solve[i];
+        struct reader e = child(&p, "solves", i);
+        get_string(&e, "name", s->name, sizeof(s->name));
+        if (!is_plain(s->name))
+            complain(&e, "name", "letters, digits, - and _");
+        s->trusted = get_bool(&e, "trusted");
+        s->rmse_held_out_percent = get_number(&e, "rmse_held_out_percent", NAN);
+        s->seconds = get_number(&e, "seconds", 0);
+        get_string(&e, "why", s->why, sizeof(s->why));
+        p.bad |= e.bad;
+    }
+    if (p.bad)
+        r->bad = true;
+}
+
+static void get_exposure(struct reader *r, struct ledger_camera *c)
+{
+    struct reader v = { .v = json_get(r->v, "exposure"), .file = r->file };
+    struct ledger_exposure *e = &c->exposure;
+    snprintf(v.where, sizeof(v.where), "%.25s.exposure", r->where);
+    if (!v.v)
+        return;
+    c->is_exposure = true;
+    e->stop = (int)get_int(&v, "stop", 0, CONFIG_STOPS_MAX - 1, 0);
+    e->bracket = (int)get_int(&v, "bracket", 0, 99, 0);
+    e->yaw_deg = get_number(&v, "yaw_deg", 0);
+    e->pitch_deg = get_number(&v, "pitch_deg", 0);
+    e->wanted_s = get_number(&v, "wanted_s", 0);
+    get_string(&v, "label", e->label, sizeof(e->label));
+    if (!(e->wanted_s > 0 && e->wanted_s < 3600))
+        complain(&v, "wanted_s", "an exposure time");
+    e->rejected = json_get(v.v, "rejected") && get_bool(&v, "rejected");
+    e->object = (int)get_int(&v, "object", 0, LEDGER_OBJECTS_MAX - 1, -1);
+    if (e->object >= 0 && frame_facts_from_json(&e->facts, json_get(v.v, "facts")))
+        complain(&v, "facts", "a frame's exposure and light");
+    r->bad |= v.bad;
+}
+
+static void get_stops(struct reader *r, struct ledger *l)
+{
+    if (json_get(r->v, "kind"))
+        l->kind = get_word(r, "kind", kind_names, TAKE_N_KINDS);
+    get_string(r, "panorama_take", l->panorama_take, sizeof(l->panorama_take));
+    if (l->kind != TAKE_PANORAMA)
+        return;
+    l->n_stops = get_length(r, "stops", CONFIG_STOPS_MAX);
+    for (int i = 0; i < l->n_stops; i++) {
+        struct reader stop = child(r, "stops", i);
+        l->stop[i] = (struct config_stop){ get_number(&stop, "yaw_deg", 0), get_number(&stop, "pitch_deg", 0) };
+        r->bad |= stop.bad;
+    }
 }
 
 static void get_camera(struct reader *r, struct ledger_camera *c)
@@ -337,7 +541,11 @@ static void get_camera(struct reader *r, struct ledger_camera *c)
         f->equal = !strcmp(f->wanted, f->found);
         r->bad |= e.bad;
     }
+    get_developed(r, c);
+    get_exposure(r, c);
     c->n_objects = get_length(r, "objects", LEDGER_OBJECTS_MAX);
+    if (c->is_exposure && c->exposure.object >= c->n_objects)
+        complain(r, "exposure.object", "one of its objects");
     for (int i = 0; i < c->n_objects; i++) {
         struct ledger_object *o = &c->object[i];
         struct reader e = child(r, "objects", i);
@@ -347,8 +555,9 @@ static void get_camera(struct reader *r, struct ledger_camera *c)
         get_string(&e, "xxh128", o->xxh128, sizeof(o->xxh128));
         o->n_retries = (int)get_int(&e, "retries", 0, INT32_MAX, 0);
         o->copied_ms = get_int(&e, "copied_ms", 0, INT64_MAX, -1);
-        if (strncmp(o->file, "raw/", 4) || !o->file[4] || o->file[4] == '.' || strchr(o->file + 4, '/'))
-            complain(&e, "file", "a file of raw/");
+        const char *name = o->file + (c->is_exposure && !strncmp(o->file, "panorama/", 9) ? 9 : 0);
+        if (strncmp(name, "raw/", 4) || !name[4] || name[4] == '.' || strchr(name + 4, '/') || (name == o->file) == c->is_exposure)
+            complain(&e, "file", "a file of raw/, or of panorama/raw/");
         for (int k = 0; k < i; k++)
             if (!strcmp(c->object[k].file, o->file))
                 complain(&e, "file", "a name of its own");
@@ -388,7 +597,9 @@ int ledger_parse(struct ledger *out, const char *text, size_t n_bytes, const cha
         out->n_measured = (int)get_int(&shot, "n_measured", 0, CONFIG_CAMERAS_MAX, 0);
         out->jitter_ns = get_int(&shot, "jitter_ns", INT64_MIN, INT64_MAX, -1);
     }
-    const int n = get_length(&r, "cameras", 4 * CONFIG_CAMERAS_MAX);
+    get_processing(&r, out);
+    get_stops(&r, out);
+    const int n = get_length(&r, "cameras", ENTRIES_MAX);
     out->camera = calloc((size_t)n + 1, sizeof(*out->camera));
     if (!out->camera) {
         json_free(doc);
@@ -399,6 +610,10 @@ int ledger_parse(struct ledger *out, const char *text, size_t n_bytes, const cha
         struct reader c = child(&r, "cameras", i);
         get_camera(&c, &out->camera[i]);
         r.bad |= c.bad;
+        if (c.v && out->camera[i].is_exposure != (out->kind == TAKE_PANORAMA) && !r.bad)
+            complain(&c, "exposure", "one in a panorama, none in a capture"), r.bad = true;
+        if (out->camera[i].is_exposure && out->camera[i].exposure.stop >= out->n_stops && !r.bad)
+            complain(&c, "exposure.stop", "one of stops"), r.bad = true;
         for (int k = 0; k < i && !r.bad; k++)
             if (!strcmp(out->camera[k].name, out->camera[i].name))
                 complain(&c, "name", "a name of its own"), r.bad = true;
@@ -457,7 +672,11 @@ static int sync_folder(const char *dir)
     return err;
 }
 
-static const char *const folders[] = { "raw", "thumbnails", "linear", "geometry", "geometry/cameras" };
+static const struct {
+    const char *name;
+    enum take_kind kind;
+} folders[] = { { "raw", TAKE_CAPTURE }, { "thumbnails", TAKE_CAPTURE }, { "linear", TAKE_CAPTURE }, { "geometry", TAKE_CAPTURE }, { "geometry/cameras", TAKE_CAPTURE },
+                { "panorama", TAKE_PANORAMA }, { "panorama/raw", TAKE_PANORAMA } };
 enum { N_FOLDERS = sizeof(folders) / sizeof(folders[0]) };
 
 static bool is_part(const char *name) // .NAME.tag.part of atomic_file, NAME.part of ingest; no camera's name holds a dot
@@ -491,13 +710,13 @@ static void remove_new(const char *dir)
     join(path, sizeof(path), dir, "take.json");
     unlink(path);
     for (int i = N_FOLDERS - 1; i >= 0; i--) {
-        join(path, sizeof(path), dir, folders[i]);
+        join(path, sizeof(path), dir, folders[i].name);
         rmdir(path);
     }
     rmdir(dir);
 }
 
-int ledger_create(const char *text, const char *id, const char *takes_dir)
+int ledger_create(const char *text, enum take_kind kind, const char *id, const char *takes_dir)
 {
     char dir[1024], final[1024], path[1200];
     join(final, sizeof(final), takes_dir, id);
@@ -507,12 +726,13 @@ int ledger_create(const char *text, const char *id, const char *takes_dir)
         return err;
     remove_new(dir); // of an earlier life that ended here
     err = mkdir(dir, 0777) ? -errno : 0;
-    for (int i = 0; i < N_FOLDERS && !err; i++) {
-        join(path, sizeof(path), dir, folders[i]);
-        err = mkdir(path, 0777) ? -errno : 0;
-    }
+    for (int i = 0; i < N_FOLDERS && !err; i++)
+        if (folders[i].kind == kind) {
+            join(path, sizeof(path), dir, folders[i].name);
+            err = mkdir(path, 0777) ? -errno : 0;
+        }
     if (!err) {
-        join(path, sizeof(path), dir, "geometry");
+        join(path, sizeof(path), dir, kind == TAKE_PANORAMA ? "panorama" : "geometry");
         err = sync_folder(path);
     }
     if (!err)
@@ -596,7 +816,7 @@ int ledger_remove_parts(const char *take_dir, int *n_removed)
     char path[1100];
     int err = remove_parts(take_dir, n_removed);
     for (int i = 0; i < N_FOLDERS && !err; i++) {
-        join(path, sizeof(path), take_dir, folders[i]);
+        join(path, sizeof(path), take_dir, folders[i].name);
         err = remove_parts(path, n_removed);
     }
     return err;
@@ -615,13 +835,14 @@ int ledger_reconcile(struct ledger *l, const char *take_dir, struct ledger_findi
         if (taken_back)
             c->debt = DEBT_OPEN;
     }
-    join(path, sizeof(path), take_dir, "raw");
+    const char *const folder = l->kind == TAKE_PANORAMA ? "panorama/raw" : "raw";
+    join(path, sizeof(path), take_dir, folder);
     DIR *d = err ? NULL : opendir(path);
     for (const struct dirent *e; d && (e = readdir(d));) {
         bool known = e->d_name[0] == '.' || is_part(e->d_name) || strstr(e->d_name, ".damaged");
         for (int i = 0; i < l->n_cameras && !known; i++)
             for (int k = 0; k < l->camera[i].n_objects && !known; k++)
-                known = !strcmp(l->camera[i].object[k].file + 4, e->d_name);
+                known = !strcmp(l->camera[i].object[k].file + strlen(folder) + 1, e->d_name);
         if (!known) {
             found->n_strangers++;
             log_warning("ledger: %s/%s is in no ledger; it is left alone", path, e->d_name);

@@ -208,6 +208,22 @@ static bool is_in_circle(const struct lens *l, const double px[2])
     return l->circle_px == 0 || hypot(px[0] - l->centre_px[0], px[1] - l->centre_px[1]) <= l->circle_px;
 }
 
+struct json *lens_json(const struct lens *l)
+{
+    struct json *o = json_new_object();
+    const double distortion[5] = { l->k[0], l->k[1], l->k[2], l->p[0], l->p[1] };
+    json_set_string(o, "model", lens_model_name(l->model));
+    json_set_int(o, "width_px", l->width_px);
+    json_set_int(o, "height_px", l->height_px);
+    json_set_number(o, "focal_px", l->focal_px);
+    json_set_numbers(o, "centre_px", l->centre_px, 2);
+    json_set_numbers(o, "distortion", distortion, 5);
+    json_set_number(o, "circle_px", l->circle_px);
+    json_set_number(o, "max_angle_deg", l->max_angle_rad * 180 / M_PI);
+    json_set_numbers(o, "shading", l->v, 3);
+    return o;
+}
+
 bool lens_project(const struct lens *l, const double dir[3], double px[2])
 {
     const double across = hypot(dir[0], dir[1]), a = atan2(across, dir[2]);

@@ -33,6 +33,7 @@ int lens_init(struct lens *lens, const char *name);
 // and the middle: "centre_px" [2], "distortion" [k1, k2, k3, p1, p2], "circle_px", "max_angle_deg", "shading" [v1, v2, v3].
 // 0; -EINVAL, logged. Ends with lens_init.
 int lens_from_json(struct lens *out, const struct json *v, const char *path, const char *name);
+struct json *lens_json(const struct lens *lens); // what lens_from_json reads
 const char *lens_model_name(enum lens_model m);
 
 // False: not seen (too far from the axis, outside the circle). The pixel may be outside the frame. dir need not be unit.

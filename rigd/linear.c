@@ -187,6 +187,17 @@ static int cell_before(double v, int n, float *weight)
     return i;
 }
 
+double flat_at(const struct flat *flat, double u, double v, int c)
+{
+    float wx, wy;
+    if (!flat)
+        return 1;
+    const int cx = cell_before(u, FLAT_COLUMNS, &wx), cy = cell_before(v, FLAT_ROWS, &wy);
+    const float above = (1 - wx) * flat->gain[cy][cx][c] + wx * flat->gain[cy][cx + 1][c];
+    const float below = (1 - wx) * flat->gain[cy + 1][cx][c] + wx * flat->gain[cy + 1][cx + 1][c];
+    return (double)((1 - wy) * above + wy * below);
+}
+
 static void apply_flat(const struct linear *l, int y, float *row, int stride)
 {
     float wy;

@@ -34,6 +34,8 @@ struct flat {
 int flat_from_frame(struct flat *out, const struct raw_frame *f, const struct saturation *s, char *why, size_t room);
 // From a picture of it in linear sRGB, or grey. srgb_from_camera: of the frames that it will be used for.
 int flat_from_image(struct flat *out, const struct image *image, const double srgb_from_camera[3][3], char *why, size_t room);
+// The gain at u, v (0 .. 1 across the frame); flat NULL: 1.
+double flat_at(const struct flat *flat, double u, double v, int c);
 
 // ---- developing ----
 struct linear {

@@ -36,5 +36,7 @@ struct lines_ops {
     int (*fd)(const void *self);                                // readable: read()
     int (*read)(void *self, struct lines_edge *edge, int max);  // without waiting: how many, or -errno (logged): the lines are lost
     int (*level)(void *self, int input);                        // 0, 1 or -errno
+    int (*head)(void *self, int32_t yaw_mdeg, int32_t pitch_mdeg); // as trigger_head(); NULL: there is none
+    bool (*arrived)(void *self, int *err);                      // after read(): the head stands still, once per accepted head()
     void (*close)(void *self);                                  // NULL allowed
 };

@@ -32,7 +32,7 @@ struct files {
     struct file *file;
 };
 
-static const char *const ignored[] = { ".DS_Store", "ascmhl", "ascmhl/", "take.json", "*.part" };
+static const char *const ignored[] = { ".DS_Store", "ascmhl", "ascmhl/", "take.json", "processing.json", "log", "log/", "*.part" };
 
 static void files_free(struct files *f)
 {
@@ -83,7 +83,7 @@ static int walk(struct files *f, const char *dir, const char *relative, int dept
         struct stat st;
         char *name = NULL;
         const size_t length = strlen(e->d_name);
-        if (e->d_name[0] == '.' || (length > 5 && !strcmp(e->d_name + length - 5, ".part")) || (!relative[0] && (!strcmp(e->d_name, "ascmhl") || !strcmp(e->d_name, "take.json"))))
+        if (e->d_name[0] == '.' || (length > 5 && !strcmp(e->d_name + length - 5, ".part")) || (!relative[0] && (!strcmp(e->d_name, "ascmhl") || !strcmp(e->d_name, "take.json") || !strcmp(e->d_name, "processing.json") || !strcmp(e->d_name, "log"))))
             continue;
         if (asprintf(&name, "%s%s%s", relative, relative[0] ? "/" : "", e->d_name) < 0) {
             err = -ENOMEM;

@@ -1,7 +1,7 @@
 // rigd/manifest.h - ASC MHL v2: a hand-over manifest that other people's tools can check.
 //
 // DIR/ascmhl/NNNN_<folder>_<date>_<time>Z.mhl lists every file with size and xxh128; ascmhl_chain.xml lists the generations with
-// their C4 hashes. take.json, temporary files and ascmhl itself are not listed (they are named in <ignore>).
+// their C4 hashes. take.json, processing.json, log/, temporary files and ascmhl itself are not listed (they are named in <ignore>).
 #pragma once
 #include <stdbool.h>
 #include <stdint.h>

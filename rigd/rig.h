@@ -41,6 +41,19 @@ enum rig_action_kind {
     RIG_TAKE_DONE, // rig_ledger() is final, and durable
     RIG_LAG_DONE,  // rig_lag() is measured: keep it
     RIG_IDENTIFIED, // camera was told; text on failure
+    RIG_HEAD,       // trigger_head(yaw_mdeg, pitch_mdeg)   -> rig_head_arrived (also when refused)
+    RIG_PROMPT,     // on: ask a person to do what text says -> rig_continue; off: no more
+    RIG_PROGRESS,   // of a panorama: tell people
+};
+
+enum rig_step { RIG_STEP_TURN, RIG_STEP_EXPOSE, RIG_STEP_FRAME, RIG_STEP_STOP_DONE };
+
+struct rig_progress {
+    enum rig_step step;
+    int stop, n_stops, bracket;
+    double yaw_deg, pitch_deg;
+    char label[16];  // EXPOSE, FRAME: the exposure time
+    char text[200];  // FRAME, STOP_DONE: what was found
 };
 
 struct rig_action {
@@ -49,10 +62,12 @@ struct rig_action {
     union {
         struct camera_command command; // RIG_SEND
         struct trigger_shot shot;      // RIG_FIRE
+        struct rig_progress progress;  // RIG_PROGRESS
+        struct { int32_t yaw_mdeg, pitch_mdeg; } head; // RIG_HEAD
     };
-    bool on;                           // RIG_POWER, RIG_RELAY
+    bool on;                           // RIG_POWER, RIG_RELAY, RIG_PROMPT
     enum rig_severity severity;        // RIG_SAY
-    char text[320];                    // RIG_SAY, RIG_IDENTIFIED
+    char text[320];                    // RIG_SAY, RIG_IDENTIFIED, RIG_PROMPT
 };
 
 // config is kept (borrowed). 0 or -ENOMEM.
@@ -73,17 +88,28 @@ void rig_press_camera(struct rig *rig, int64_t now_ns, int camera); // trigger_h
 void rig_space(struct rig *rig, int64_t now_ns, int64_t free_bytes); // < 0: -errno
 void rig_committed(struct rig *rig, int64_t now_ns, int err);        // in the order of RIG_CREATE and RIG_COMMIT
 void rig_manifest_written(struct rig *rig, int64_t now_ns, int err);
+void rig_head_arrived(struct rig *rig, int64_t now_ns, int err); // trigger_host.head_arrived
 
 // ---- what is wanted ------------------------------------------------------------------------------------------------------
 // 0, or -EBUSY (a take is under way), -ENOTCONN (no trigger), -EINVAL (no such camera), with a sentence in why[200].
-struct rig_take { const char *id, *name, *created; int64_t utc_ms; const char *takes_dir; };
+struct rig_take {
+    const char *id, *name, *created;
+    int64_t utc_ms;
+    const char *takes_dir;
+    const char *panorama_take; // capture: the newest panorama there is; NULL
+};
 int rig_capture(struct rig *rig, int64_t now_ns, const struct rig_take *take, bool without_missing, char *why);
+// A take of kind panorama: for each stop the head turns (or a person turns it: RIG_PROMPT), then the panorama camera alone is exposed as
+// bracket_next() asks for, frame by frame; each is fetched and judged before the next. -EINVAL: no [panorama] in the configuration.
+int rig_panorama(struct rig *rig, int64_t now_ns, const struct rig_take *take, char *why);
+int rig_continue(struct rig *rig, int64_t now_ns, char *why); // what RIG_PROMPT asked for is done
 // Preflight alone.
 int rig_preflight(struct rig *rig, int64_t now_ns, char *why);
 // n shots without frames fetched: lag per body. Frames stay on the cards.
 int rig_calibrate(struct rig *rig, int64_t now_ns, int n_shots, char *why);
-// Finish a take of an earlier life; ledger (reconciled with the disk) is taken over and zeroed when 0 is returned.
-int rig_resume(struct rig *rig, int64_t now_ns, struct ledger *ledger, const char *takes_dir, char *why);
+// Finish a take of an earlier life; ledger (reconciled with the disk) is taken over and zeroed when 0 is returned. A panorama keeps the
+// exposures that are here or on the card, and shoots those that are missing: with a head that is turned by hand only if attended.
+int rig_resume(struct rig *rig, int64_t now_ns, struct ledger *ledger, const char *takes_dir, bool attended, char *why);
 int rig_identify(struct rig *rig, int64_t now_ns, int camera, char *why);
 int rig_reinstate(struct rig *rig, int64_t now_ns, int camera, char *why); // out of quarantine, or anew
 int rig_cancel(struct rig *rig, int64_t now_ns, char *why); // before the shutters are pressed; later the frames are collected all the same
@@ -113,6 +139,7 @@ const struct rig_finding *rig_finding(const struct rig *rig, int i);
 
 enum take_state rig_state(const struct rig *rig); // of the take under way, TAKE_IDLE without one
 const char *rig_outcome(const struct rig *rig);   // why the last take, preflight or calibration failed; "": it did not
+const char *rig_prompt(const struct rig *rig);    // what a person is asked to do; "": nothing
 bool rig_is_busy(const struct rig *rig);          // capture would be refused
 const struct ledger *rig_ledger(const struct rig *rig); // of the take under way or the last one; NULL: none yet
 void rig_set_lag(struct rig *rig, const struct lag *lag); // as read from lag.json

@@ -1,6 +1,7 @@
 // rigd/rigctl_develop.c - see rigctl_develop.h.
 #include "rigd/rigctl_develop.h"
 #include "rigd/colour.h"
+#include "rigd/develop_options.h"
 #include "solver/take/atomic_file.h"
 #include "solver/take/json.h"
 #include "solver/take/log.h"
@@ -135,7 +136,7 @@ static int run_crew(struct crew *c, const char *stage)
     struct worker worker[JOBS_MAX] = { 0 };
     struct pollfd at[JOBS_MAX];
     int next = 0, busy = 0;
-    int err = find_program(c);
+    int err = 0;
     c->answer = calloc((size_t)c->n_frames, sizeof(c->answer[0]));
     if (!err && !c->answer)
         err = -ENOMEM;
@@ -165,7 +166,7 @@ static int run_crew(struct crew *c, const char *stage)
             finish(c, &worker[i]);
         }
     progress_end();
-    if (err && err != -ENOENT)
+    if (err)
         log_error("develop: %s", strerror(-err));
     return err;
 }
@@ -213,6 +214,13 @@ static int parse_count(struct argp_state *state, const char *option, const char 
     return (int)n;
 }
 
+static void require_exposure(struct argp_state *state, const char *option, const char *text, bool zero_allowed)
+{
+    double v[3];
+    if (!option_exposure(text, v, zero_allowed))
+        argp_error(state, "%s: found '%s'; expected seconds, f-number and ISO such as 1/128,8,100", option, text);
+}
+
 static const char *base_name(const char *path)
 {
     const char *slash = strrchr(path, '/');
@@ -252,18 +260,19 @@ static const struct argp_option develop_options[] = {
     { 0 },
 };
 
-static void pass(struct argp_state *state, struct develop_arguments *a, const char *option, char *value)
+static void pass(struct argp_state *state, char *passed[PASSED_MAX], int *n_passed, const char *option, char *value)
 {
-    if (a->n_passed + 2 > PASSED_MAX)
+    if (*n_passed + 2 > PASSED_MAX)
         argp_error(state, "%s: too many options", option);
-    a->passed[a->n_passed++] = (char *)(uintptr_t)option;
+    passed[(*n_passed)++] = (char *)(uintptr_t)option;
     if (value)
-        a->passed[a->n_passed++] = value;
+        passed[(*n_passed)++] = value;
 }
 
 static error_t parse_develop(int key, char *text, struct argp_state *state)
 {
     struct develop_arguments *a = state->input;
+    double dn;
     switch (key) {
     case 'o':
         a->folder = text;
@@ -272,31 +281,35 @@ static error_t parse_develop(int key, char *text, struct argp_state *state)
         a->json = true;
         return 0;
     case OPTION_TIFF:
-        pass(state, a, "--tiff", NULL);
+        pass(state, a->passed, &a->n_passed, "--tiff", NULL);
         return 0;
     case OPTION_HALF:
-        pass(state, a, "--half", NULL);
+        pass(state, a->passed, &a->n_passed, "--half", NULL);
         return 0;
     case OPTION_BILINEAR:
-        pass(state, a, "--bilinear", NULL);
+        pass(state, a->passed, &a->n_passed, "--bilinear", NULL);
         return 0;
     case OPTION_AHD:
-        pass(state, a, "--ahd", NULL);
+        pass(state, a->passed, &a->n_passed, "--ahd", NULL);
         return 0;
     case OPTION_FLAT:
-        pass(state, a, "--flat", text);
+        pass(state, a->passed, &a->n_passed, "--flat", text);
         return 0;
     case OPTION_COLOUR:
-        pass(state, a, "--colour", text);
+        pass(state, a->passed, &a->n_passed, "--colour", text);
         return 0;
     case OPTION_REFERENCE:
-        pass(state, a, "--reference-exposure", text);
+        require_exposure(state, "--reference-exposure", text, false);
+        pass(state, a->passed, &a->n_passed, "--reference-exposure", text);
         return 0;
     case OPTION_EXPOSURE:
-        pass(state, a, "--exposure", text);
+        require_exposure(state, "--exposure", text, true);
+        pass(state, a->passed, &a->n_passed, "--exposure", text);
         return 0;
     case OPTION_SATURATION:
-        pass(state, a, "--saturation", text);
+        if (!option_saturation(text, &dn))
+            argp_error(state, "--saturation: found '%s'; expected 1 to 65535", text);
+        pass(state, a->passed, &a->n_passed, "--saturation", text);
         return 0;
     case OPTION_MODEL:
         a->model = text;
@@ -377,42 +390,38 @@ static void value_text(const struct json *answer, const char *key, char text[80]
         snprintf(text, 80, "%.79s", text_of(answer, key));
 }
 
+static int by_value(const void *a, const void *b)
+{
+    return strcmp(a, b);
+}
+
 static void name_odd_ones(const struct develop_arguments *a, const struct crew *c, const char *key, const char *what, struct json *warnings)
 {
-    char common[80] = "", one[80], line[600];
-    int most = 0, n_ok = 0, n_odd = 0;
+    char (*value)[80] = calloc((size_t)a->n, sizeof(*value)), common[80] = "", one[80], line[600] = "", text[800];
+    int most = 0, n_ok = 0, n_odd = 0, run = 0;
     size_t n = 0;
-    for (int i = 0; i < a->n && most <= a->n / 2; i++) {
-        int same = 0;
-        if (!flag_of(c->answer[i], "ok"))
-            continue;
-        char candidate[80];
-        value_text(c->answer[i], key, candidate);
-        for (int k = 0; k < a->n; k++) {
-            if (!flag_of(c->answer[k], "ok"))
-                continue;
-            value_text(c->answer[k], key, one);
-            same += !strcmp(one, candidate);
-        }
-        if (same > most) {
-            most = same;
-            strcpy(common, candidate);
+    for (int i = 0; value && i < a->n; i++)
+        if (flag_of(c->answer[i], "ok"))
+            value_text(c->answer[i], key, value[n_ok++]);
+    if (value)
+        qsort(value, (size_t)n_ok, sizeof(*value), by_value);
+    for (int i = 0; i < n_ok; i++) {
+        run = i && !strcmp(value[i], value[i - 1]) ? run + 1 : 1;
+        if (run > most) {
+            most = run;
+            strcpy(common, value[i]);
         }
     }
-    line[0] = 0;
-    for (int i = 0; i < a->n; i++) {
-        if (!flag_of(c->answer[i], "ok"))
-            continue;
-        n_ok++;
+    free(value);
+    for (int i = 0; i < a->n && most < n_ok; i++) {
         value_text(c->answer[i], key, one);
-        if (!strcmp(one, common))
+        if (!flag_of(c->answer[i], "ok") || !strcmp(one, common))
             continue;
         if (n_odd++ < 8 && n < sizeof(line))
             n += (size_t)snprintf(line + n, sizeof(line) - n, "%s%s has %s", n_odd > 1 ? ", " : "", base_name(a->raw[i]), one[0] ? one : "none");
     }
     if (!n_odd)
         return;
-    char text[800];
     snprintf(text, sizeof(text), "%s differs: %d of %d have %s, but %s%s", what, most, n_ok, common[0] ? common : "none", line, n_odd > 8 ? ", ..." : "");
     log_warning("develop: %s", text);
     json_append_string(warnings, text);
@@ -531,7 +540,7 @@ int rigctl_develop(int argc, char **argv, bool json)
     if (status)
         goto done;
     struct crew crew = { .n_frames = a.n, .n_jobs = a.n_jobs, .arguments = develop_command, .arg = &a };
-    status = run_crew(&crew, "develop") ? EXIT_FAILED : report_frames(&a, &crew, seconds_since(&began));
+    status = find_program(&crew) || run_crew(&crew, "develop") ? EXIT_FAILED : report_frames(&a, &crew, seconds_since(&began));
     free_answers(&crew);
 done:
     for (int i = 0; a.out && i < a.n; i++)
@@ -548,7 +557,8 @@ struct colour_arguments {
     int n, n_jobs;
     char *everywhere; // for raws that places does not name
     const char *places_path, *out, *reference, *check;
-    char *exposure;
+    char *passed[PASSED_MAX]; // to rigd-develop
+    int n_passed;
     bool json;
 };
 
@@ -559,6 +569,7 @@ static const struct argp_option colour_options[] = {
     { "places", OPTION_PLACES, "FILE", 0, "The same frame by frame: {\"places\": [{\"file\": \"A01.dng\", \"patch\": [X,Y,W,H]}, {\"file\": ..., \"chart\": [X1,...,Y4]}]}", 0 },
     { "reference", OPTION_BODY, "SERIAL", 0, "The body that is right, such as the panorama's (default: the median of all)", 0 },
     { "check", OPTION_CHECK, "FILE", 0, "Write nothing: how well does this calibration bring these frames together?", 0 },
+    { "flat", OPTION_FLAT, "FILE", 0, "Divide by this frame of an even white, as rigctl develop will: the card lies elsewhere in each frame", 0 },
     { "exposure", OPTION_EXPOSURE, "T,N,ISO", 0, "What the exposures were, in place of what the files say; 0 leaves a value to them", 0 },
     { "jobs", OPTION_JOBS, "N", 0, "Frames at once (default: one per core)", 0 },
     { "json", 'j', NULL, 0, "Print the result as JSON", 0 },
@@ -575,6 +586,7 @@ static void set_everywhere(struct argp_state *state, struct colour_arguments *a,
 static error_t parse_colour(int key, char *text, struct argp_state *state)
 {
     struct colour_arguments *a = state->input;
+    double corner[4][2];
     switch (key) {
     case 'o':
         a->out = text;
@@ -583,9 +595,13 @@ static error_t parse_colour(int key, char *text, struct argp_state *state)
         a->json = true;
         return 0;
     case OPTION_PATCH:
+        if (!option_patch(text, corner))
+            argp_error(state, "--patch: found '%s'; expected X,Y,W,H", text);
         set_everywhere(state, a, "--patch", text);
         return 0;
     case OPTION_CHART:
+        if (!option_chart(text, corner))
+            argp_error(state, "--chart: found '%s'; expected the x,y of four corners", text);
         set_everywhere(state, a, "--chart", text);
         return 0;
     case OPTION_PLACES:
@@ -597,8 +613,12 @@ static error_t parse_colour(int key, char *text, struct argp_state *state)
     case OPTION_CHECK:
         a->check = text;
         return 0;
+    case OPTION_FLAT:
+        pass(state, a->passed, &a->n_passed, "--flat", text);
+        return 0;
     case OPTION_EXPOSURE:
-        a->exposure = text;
+        require_exposure(state, "--exposure", text, true);
+        pass(state, a->passed, &a->n_passed, "--exposure", text);
         return 0;
     case OPTION_JOBS:
         a->n_jobs = parse_count(state, "--jobs", text, JOBS_MAX);
@@ -670,15 +690,13 @@ static int find_places(struct colour_arguments *a)
 static char **measure_command(void *arg, int frame)
 {
     const struct colour_arguments *a = arg;
-    char **argv = calloc(7, sizeof(argv[0]));
+    char **argv = calloc((size_t)a->n_passed + 5, sizeof(argv[0]));
     int n = 1;
     if (!argv)
         return NULL;
     argv[n++] = a->place[frame];
-    if (a->exposure) {
-        argv[n++] = "--exposure";
-        argv[n++] = a->exposure;
-    }
+    for (int i = 0; i < a->n_passed; i++)
+        argv[n++] = a->passed[i];
     argv[n++] = "--";
     argv[n] = a->raw[frame];
     return argv;
@@ -830,7 +848,7 @@ int rigctl_calibrate_colour(int argc, char **argv, bool json)
     if (find_places(&a))
         goto done;
     struct crew crew = { .n_frames = a.n, .n_jobs = a.n_jobs, .arguments = measure_command, .arg = &a };
-    if (!run_crew(&crew, "measure"))
+    if (!find_program(&crew) && !run_crew(&crew, "measure"))
         status = fit_frames(&a, &crew);
     free_answers(&crew);
 done:

@@ -448,5 +448,6 @@ static int trigger_gpio_open(void **self, const struct config *config, const str
     return trigger_lines_open((struct trigger_lines **)self, config, host, &gpio_lines, false);
 }
 
-const struct trigger_ops trigger_gpio = { trigger_gpio_open, trigger_lines_abilities, trigger_lines_fire, trigger_lines_release,
-    trigger_lines_relay, trigger_lines_fd, trigger_lines_dispatch, trigger_lines_close };
+const struct trigger_ops trigger_gpio = { .open = trigger_gpio_open, .abilities = trigger_lines_abilities, .fire = trigger_lines_fire,
+    .release = trigger_lines_release, .relay = trigger_lines_relay, .fd = trigger_lines_fd, .dispatch = trigger_lines_dispatch,
+    .close = trigger_lines_close };

@@ -350,6 +350,9 @@ void trigger_lines_dispatch(void *self)
     const struct trigger_host *host = t->host;
     if (fired)
         host->fired(host->arg, err, pressed_ns, late_ns);
+    int head_err;
+    if (!broken && t->ops->arrived && t->ops->arrived(t->lines, &head_err) && host->head_arrived)
+        host->head_arrived(host->arg, head_err);
     if (broken)
         host->broken(host->arg, -EIO); // last: the host may close us
 }
@@ -360,7 +363,7 @@ unsigned trigger_lines_abilities(const void *self)
 {
     const struct trigger_lines *t = self;
     const bool button = t->button != CONFIG_NONE;
-    return TRIGGER_SYNCHRONISED | edges_abilities(&t->edges) | (button ? TRIGGER_BUTTON : 0) |
+    return TRIGGER_SYNCHRONISED | (t->ops->head ? TRIGGER_HEAD : 0) | edges_abilities(&t->edges) | (button ? TRIGGER_BUTTON : 0) |
         (t->n_inputs > button ? TRIGGER_FEEDBACK : 0);
 }
 
@@ -411,6 +414,15 @@ int trigger_lines_relay(void *self, int camera, bool cut)
         }
         pthread_cond_signal(&t->wake); // it may not stay cut for ever
     }
+    pthread_mutex_unlock(&t->lock);
+    return err;
+}
+
+int trigger_lines_head(void *self, int32_t yaw_mdeg, int32_t pitch_mdeg)
+{
+    struct trigger_lines *t = self;
+    pthread_mutex_lock(&t->lock);
+    const int err = t->broken ? -EIO : t->edges.pending ? -EBUSY : t->ops->head ? t->ops->head(t->lines, yaw_mdeg, pitch_mdeg) : -ENOTSUP;
     pthread_mutex_unlock(&t->lock);
     return err;
 }

@@ -15,6 +15,7 @@ unsigned trigger_lines_abilities(const void *self);
 int trigger_lines_fire(void *self, const struct trigger_shot *shot);
 void trigger_lines_release(void *self);
 int trigger_lines_relay(void *self, int camera, bool cut);
+int trigger_lines_head(void *self, int32_t yaw_mdeg, int32_t pitch_mdeg);
 int trigger_lines_fd(const void *self);
 void trigger_lines_dispatch(void *self);
 void trigger_lines_close(void *self);

@@ -1,4 +1,4 @@
-// rigd/trigger_sim.c - the simulated rig's wires: rigsim's shutter lines (rigd/shutter_line.h) over its socket.
+// rigd/trigger_sim.c - the simulated rig's wires and its panorama head: rigsim's shutter lines (rigd/shutter_line.h) over its socket.
 //
 // rigsim counts lag from the time written into a change, so this trigger is exact however busy the host is; what a real host would
 // have added is not simulated here.
@@ -18,6 +18,9 @@ struct simulated {
     int fd, n_outputs, n_inputs;
     int line[EDGES_WIRES_MAX]; // of each output: EDGES_LINE_OF(camera, role)
     uint64_t was_active[LINES_WORDS];
+    bool head_moves, head_stands; // asked to | and has arrived, which nobody has been told
+    int head_err;
+    uint64_t head_tag;
     char address[108];
 };
 
@@ -89,6 +92,27 @@ static int simulated_set(void *self, const uint64_t *active, const uint64_t *cha
     return err ? err : send_records(s, record, n);
 }
 
+static int simulated_head(void *self, int32_t yaw_mdeg, int32_t pitch_mdeg)
+{
+    struct simulated *s = self;
+    if (s->head_moves)
+        return -EBUSY;
+    const struct shutter_line record = { .kind = SHUTTER_LINE_HEAD, .tag = ++s->head_tag, .yaw_mdeg = yaw_mdeg, .pitch_mdeg = pitch_mdeg };
+    const int err = send_records(s, &record, 1);
+    s->head_moves = !err;
+    s->head_stands = false;
+    return err;
+}
+
+static bool simulated_arrived(void *self, int *err)
+{
+    struct simulated *s = self;
+    const bool stands = s->head_stands;
+    *err = s->head_err;
+    s->head_stands = false;
+    return stands;
+}
+
 static int simulated_fd(const void *self)
 {
     return ((const struct simulated *)self)->fd;
@@ -113,7 +137,11 @@ static int simulated_read(void *self, struct lines_edge *edge, int max)
         const struct shutter_line *r = &record[i];
         if (r->kind == SHUTTER_LINE_SYNC && r->channel < (uint32_t)s->n_inputs)
             edge[n++] = (struct lines_edge){ (int)r->channel, true, r->at_ns };
-        else if (r->kind == SHUTTER_LINE_REFUSED)
+        else if (s->head_moves && r->tag == s->head_tag && (r->kind == SHUTTER_LINE_ARRIVED || (r->kind == SHUTTER_LINE_REFUSED && !r->line))) {
+            s->head_moves = false;
+            s->head_stands = true;
+            s->head_err = -(int)r->error;
+        } else if (r->kind == SHUTTER_LINE_REFUSED)
             log_warning("trigger: the simulated rig refused a change of camera %u: %s", r->channel, strerror((int)r->error));
     }
     return n;
@@ -126,12 +154,13 @@ static int simulated_level(void *self, int input)
 }
 
 static const struct lines_ops simulated_lines = { .timed = true, .open = simulated_open, .set = simulated_set, .fd = simulated_fd,
-    .read = simulated_read, .level = simulated_level, .close = simulated_close };
+    .read = simulated_read, .level = simulated_level, .head = simulated_head, .arrived = simulated_arrived, .close = simulated_close };
 
 static int trigger_simulated_open(void **self, const struct config *config, const struct trigger_host *host)
 {
     return trigger_lines_open((struct trigger_lines **)self, config, host, &simulated_lines, true);
 }
 
-const struct trigger_ops trigger_simulated = { trigger_simulated_open, trigger_lines_abilities, trigger_lines_fire,
-    trigger_lines_release, trigger_lines_relay, trigger_lines_fd, trigger_lines_dispatch, trigger_lines_close };
+const struct trigger_ops trigger_simulated = { .open = trigger_simulated_open, .abilities = trigger_lines_abilities,
+    .fire = trigger_lines_fire, .release = trigger_lines_release, .relay = trigger_lines_relay, .head = trigger_lines_head, .fd = trigger_lines_fd,
+    .dispatch = trigger_lines_dispatch, .close = trigger_lines_close };

@@ -105,5 +105,5 @@ static void software_dispatch(void *self)
     s->host->fired(s->host->arg, s->cancelled ? -ECANCELED : 0, now_ns, now_ns - s->at_ns);
 }
 
-const struct trigger_ops trigger_software = { software_open, software_abilities, software_fire, software_release, NULL, software_fd,
-    software_dispatch, software_close };
+const struct trigger_ops trigger_software = { .open = software_open, .abilities = software_abilities, .fire = software_fire,
+    .release = software_release, .fd = software_fd, .dispatch = software_dispatch, .close = software_close };

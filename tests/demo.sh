@@ -18,7 +18,7 @@ finish() {
 trap finish EXIT
 if [ "$n_cameras" -gt 0 ]; then
     step "rig: $n_cameras simulated cameras that real libgphoto2 talks to, and rigd with a process for each"
-    port=$((20000 + $$ % 2000 * 20))
+    port=$((10000 + $$ % 1100 * 20))
     simulate="$bin/rigsim --cameras $n_cameras --personality nikon --port $port --seed 1 --trigger-socket $wires/wires"
     {
         printf '[rig]\nname = demo\ntakes = %s\nstate = %s\nsocket = %s\npersonality_dir = %s\nraw_mb = 9\nfree_space_mb = 200\n' \

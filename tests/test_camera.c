@@ -41,6 +41,7 @@ static void every_command_survives_the_way(void **state)
         c.object = (struct camera_object){ "/store_00010001/DCIM/100NIKON", "DSC_0001.NEF", (int64_t)5 << 32 };
         strcpy(c.path, "/var/lib/rigd/takes/t/raw/A01.nef");
         strcpy(c.xxh128, "0123456789abcdef0123456789abcdef");
+        strcpy(c.judge, "{\"model\":\"equisolid\"}");
         size_t n;
         char *text = camera_command_encode(&c, &n);
         assert_non_null(text);
@@ -79,6 +80,25 @@ static void the_longest_answer_fits_into_a_message(void **state)
     free(text);
 }
 
+static void what_a_frame_shows_arrives_as_it_was_measured(void **state)
+{
+    (void)state;
+    struct camera_event e, back;
+    memset(&e, 0, sizeof(e));
+    e.kind = CAMERA_DONE, e.seq = 9, e.command = CAMERA_FETCH, e.size_bytes = 8000000, e.judged = true;
+    strcpy(e.xxh128, "0123456789abcdef0123456789abcdef");
+    e.frame.f_number = 8, e.frame.iso = 64;
+    strcpy(e.frame.serial, "6001001");
+    e.frame.light = (struct bracket_statistics){ .exposure_s = 1. / 3, .n_sites = { 1, 2, 3 }, .n_over = { 0, 2, 1 }, .brightest = { .1, 1. / 3, 1 }, .first_percentile = { -.001, 0, .1 },
+                                                 .median = { .2, .3, .4 }, .plateau_dn = 15892 };
+    size_t n;
+    char *text = camera_event_encode(&e, &n);
+    assert_int_equal(camera_event_decode(&back, text, n), 0);
+    assert_true(back.judged);
+    assert_memory_equal(&e.frame, &back.frame, sizeof(e.frame));
+    free(text);
+}
+
 static void a_status_keeps_what_is_unknown_unknown(void **state)
 {
     (void)state;
@@ -104,6 +124,9 @@ static void strange_messages_are_refused(void **state)
         "{\"event\":\"done\",\"seq\":1,\"command\":\"fetch\"}",
         "{\"event\":\"done\",\"seq\":1,\"command\":\"fetch\",\"xxh128\":\"0123456789ABCDEF0123456789ABCDEF\"}",
         "{\"event\":\"object\",\"seq\":1}",
+        "{\"event\":\"done\",\"seq\":1,\"command\":\"fetch\",\"xxh128\":\"0123456789abcdef0123456789abcdef\",\"frame\":{}}",
+        "{\"event\":\"done\",\"seq\":1,\"command\":\"fetch\",\"xxh128\":\"0123456789abcdef0123456789abcdef\",\"frame\":{\"exposure_s\":-1,\"f_number\":8,\"iso\":100,\"serial\":\"\","
+        "\"sites\":[1,1,1],\"over\":[0,0,0],\"brightest\":[0,0,0],\"first_percentile\":[0,0,0],\"median\":[0,0,0]}}",
         "{\"event\":\"object\",\"seq\":1,\"objects\":[{\"folder\":\"/a\",\"name\":\"../x\",\"size\":1}]}",
         "{\"event\":\"object\",\"seq\":1,\"objects\":[{\"folder\":\"/a\",\"name\":\".hidden\",\"size\":1}]}",
         "{\"event\":\"object\",\"seq\":1,\"objects\":[{\"folder\":\"a\",\"name\":\"x\",\"size\":1}]}",
@@ -151,6 +174,7 @@ int main(void)
     const struct CMUnitTest tests[] = {
         cmocka_unit_test(every_command_survives_the_way),
         cmocka_unit_test(the_longest_answer_fits_into_a_message),
+        cmocka_unit_test(what_a_frame_shows_arrives_as_it_was_measured),
         cmocka_unit_test(a_status_keeps_what_is_unknown_unknown),
         cmocka_unit_test(strange_messages_are_refused),
         cmocka_unit_test(cards_are_read_in_the_order_they_were_written),

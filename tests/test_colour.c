@@ -114,7 +114,7 @@ static struct colour_frame measured(const char *serial, const double gain[3], do
     struct saturation s;
     char why[200] = "";
     assert_int_equal(saturation_of(&s, &f, f.saturation), 0);
-    assert_int_equal(colour_measure(out.cell, &f, &s, 1, corners, CHART_COLUMNS, CHART_ROWS, .5, why, sizeof(why)), 0);
+    assert_int_equal(colour_measure(out.cell, &f, &s, NULL, 1, corners, CHART_COLUMNS, CHART_ROWS, .5, why, sizeof(why)), 0);
     snprintf(out.serial, sizeof(out.serial), "%s", serial);
     memcpy(out.srgb_from_camera, srgb_from_camera, sizeof(srgb_from_camera));
     saturation_free(&s);
@@ -175,6 +175,28 @@ static void a_chart_in_perspective_gives_the_gains_and_its_own_colours(void **st
     colour_free(&fit.colour);
 }
 
+// The spread is measured where it was not fitted: with one frame per body a fit to everything would always say 0.
+static void a_card_that_two_bodies_see_differently_shows_in_the_spread(void **state)
+{
+    (void)state;
+    struct colour_frame frame[2] = { { .n_cells = 9, .serial = "1" }, { .n_cells = 9, .serial = "2" } };
+    struct colour_fit fit;
+    char why[200] = "";
+    for (int b = 0; b < 2; b++)
+        for (int k = 0; k < 9; k++)
+            for (int c = 0; c < 3; c++)
+                frame[b].cell[k].mean[c] = frame[b].cell[k].raw[c] = .3 * (b ? 1.1 : 1);
+    assert_int_equal(colour_fit(&fit, frame, 2, NULL, NULL, why, sizeof(why)), 0);
+    assert_true(fit.grey_spread < 1e-12);
+    assert_true(isnan(fit.chart_rms));
+    colour_free(&fit.colour);
+    for (int k = 1; k < 9; k += 2)
+        frame[1].cell[k].mean[RAW_BLUE] *= 1.03;
+    assert_int_equal(colour_fit(&fit, frame, 2, NULL, NULL, why, sizeof(why)), 0);
+    assert_true(fit.grey_spread > .029 && fit.grey_spread < .031);
+    colour_free(&fit.colour);
+}
+
 static void a_chart_that_is_clipped_or_dark_is_refused(void **state)
 {
     (void)state;
@@ -199,11 +221,11 @@ static void corners_that_make_no_chart_are_refused(void **state)
     const double outside[4][2] = { { -1, 0 }, { 100, 0 }, { 100, 100 }, { 0, 100 } }, crossed[4][2] = { { 0, 0 }, { 100, 100 }, { 100, 0 }, { 0, 100 } },
                  mirrored[4][2] = { { 100, 0 }, { 0, 0 }, { 0, 100 }, { 100, 100 } }, tiny[4][2] = { { 10, 10 }, { 30, 10 }, { 30, 25 }, { 10, 25 } }, nan[4][2] = { { NAN, 0 }, { 1, 0 }, { 1, 1 }, { 0, 1 } };
     assert_int_equal(saturation_of(&s, &f, f.saturation), 0);
-    assert_int_equal(colour_measure(cell, &f, &s, 1, outside, 6, 4, .5, why, sizeof(why)), -EINVAL);
-    assert_int_equal(colour_measure(cell, &f, &s, 1, crossed, 6, 4, .5, why, sizeof(why)), -EINVAL);
-    assert_int_equal(colour_measure(cell, &f, &s, 1, mirrored, 6, 4, .5, why, sizeof(why)), -EINVAL);
-    assert_int_equal(colour_measure(cell, &f, &s, 1, tiny, 6, 4, .5, why, sizeof(why)), -EINVAL);
-    assert_int_equal(colour_measure(cell, &f, &s, 1, nan, 6, 4, .5, why, sizeof(why)), -EINVAL);
+    assert_int_equal(colour_measure(cell, &f, &s, NULL, 1, outside, 6, 4, .5, why, sizeof(why)), -EINVAL);
+    assert_int_equal(colour_measure(cell, &f, &s, NULL, 1, crossed, 6, 4, .5, why, sizeof(why)), -EINVAL);
+    assert_int_equal(colour_measure(cell, &f, &s, NULL, 1, mirrored, 6, 4, .5, why, sizeof(why)), -EINVAL);
+    assert_int_equal(colour_measure(cell, &f, &s, NULL, 1, tiny, 6, 4, .5, why, sizeof(why)), -EINVAL);
+    assert_int_equal(colour_measure(cell, &f, &s, NULL, 1, nan, 6, 4, .5, why, sizeof(why)), -EINVAL);
     saturation_free(&s);
     raw_free(&f);
 }
@@ -241,6 +263,7 @@ int main(void)
     const struct CMUnitTest tests[] = {
         cmocka_unit_test(the_charts_colours_are_the_published_ones),
         cmocka_unit_test(a_chart_in_perspective_gives_the_gains_and_its_own_colours),
+        cmocka_unit_test(a_card_that_two_bodies_see_differently_shows_in_the_spread),
         cmocka_unit_test(a_chart_that_is_clipped_or_dark_is_refused),
         cmocka_unit_test(corners_that_make_no_chart_are_refused),
         cmocka_unit_test(the_file_is_read_or_refused_by_what_is_wrong),

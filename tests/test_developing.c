@@ -1,5 +1,6 @@
 // tests/test_developing.c - rigd-develop and rigctl develop as programs: equal to dcraw, true to the light that a simulated sensor saw, honest
 // about what is wrong, whole after any kill.
+#include "rigd/colour.h"
 #include "solver/take/image.h"
 #include "solver/take/json.h"
 #include "solver/take/log.h"
@@ -444,6 +445,45 @@ static void a_kill_at_any_time_leaves_whole_files_or_none(void **state)
     scratch_empty();
 }
 
+// The parent dies: its decoders die with it, and what they had finished is not done again.
+static void a_killed_run_goes_on_where_it_was(void **state)
+{
+    (void)state;
+    enum { RAWS = 8, KILLS = 6 };
+    const struct raw_dng_info info = raw_info(600, 400);
+    struct json *o;
+    int n_before = 0;
+    for (int i = 0; i < RAWS; i++) {
+        char name[20];
+        uint32_t seed = (uint32_t)i;
+        snprintf(name, sizeof(name), "%d.dng", i);
+        raw_write(scratch_path(name), &info, raw_scatter, &seed);
+    }
+    for (int k = 0; k < KILLS; k++) {
+        assert_int_equal(run(NULL, "$BIN/rigctl develop --bilinear --jobs 2 -o $D/out $D/?.dng >/dev/null 2>&1 & p=$!; sleep .0%d; kill -9 $p; "
+                                   "while for f in /proc/[0-9]*/cmdline; do tr '\\0' ' ' <$f; echo; done 2>/dev/null | grep -q \"[r]igd-develop .*$D/out\"; do sleep .02; done",
+                             2 + k),
+                         0);
+        assert_int_equal(run(&o, "echo \"{\\\"n\\\": $(ls $D/out 2>/dev/null | wc -l)}\""), 0);
+        assert_true((int)number(o, "n") >= n_before);
+        n_before = (int)number(o, "n");
+        json_free(o);
+    }
+    assert_int_equal(run(&o, "$BIN/rigctl develop --bilinear --json -o $D/out $D/?.dng 2>/dev/null"), 0);
+    assert_int_equal((int)number(o, "n_skipped"), n_before);
+    assert_int_equal((int)number(o, "n_developed"), RAWS - n_before);
+    json_free(o);
+    for (int i = 0; i < RAWS; i++) {
+        char path[40];
+        struct image im;
+        snprintf(path, sizeof(path), "out/%d.exr", i);
+        assert_int_equal(image_read(&im, scratch_path(path)), 0);
+        image_free(&im);
+    }
+    assert_int_equal(run(NULL, "test -z \"$(find $D -name '*.part')\" && rm -r $D/out"), 0);
+    scratch_empty();
+}
+
 static void a_bad_frame_is_named_and_the_others_are_done(void **state)
 {
     (void)state;
@@ -461,8 +501,68 @@ static void a_bad_frame_is_named_and_the_others_are_done(void **state)
     assert_int_equal(run(NULL, "grep -q b.dng $D/said && grep -q none.dng $D/said && test ! -e $D/out/b.exr -a -e $D/out/a.exr -a -e $D/out/c.exr"), 0);
     assert_int_equal(run(NULL, "mkdir $D/other; cp $D/a.dng $D/other; $BIN/rigctl develop -o $D/out $D/a.dng $D/other/a.dng 2>/dev/null"), 2);
     assert_int_equal(run(NULL, "$BIN/rigctl develop $D/a.dng 2>/dev/null"), 2);
-    assert_int_equal(run(NULL, "$BIN/rigctl develop -o $D/out --jobs 0 $D/a.dng 2>/dev/null"), 2);
+    static const char *const bad[] = { "develop -o $D/out --jobs 0", "develop -o $D/out --exposure 1/0,8,100", "develop -o $D/out --exposure 1,8", "develop -o $D/out --reference-exposure 0,8,100",
+                                       "develop -o $D/out --saturation 0", "develop -o $D/out --nonsense", "calibrate colour -o $D/c.json --patch 1,2,0,4", "calibrate colour -o $D/c.json --patch nan,2,3,4",
+                                       "calibrate colour -o $D/c.json --chart 1,2,3,4", "calibrate colour --patch 1,2,3,4", "calibrate colour -o $D/c.json" };
+    for (size_t i = 0; i < sizeof(bad) / sizeof(bad[0]); i++)
+        assert_int_equal(run(NULL, "$BIN/rigctl %s $D/a.dng 2>/dev/null", bad[i]), 2);
     assert_int_equal(run(NULL, "rm -r $D/out $D/other"), 0);
+    scratch_empty();
+}
+
+static void a_decoder_that_dies_costs_one_frame_and_is_named(void **state)
+{
+    (void)state;
+    static const char program[] = "#!/bin/sh\n"
+                                  "for word; do last=$word; done\n"
+                                  "case $last in */b.exr) kill -SEGV $$ ;; */c.exr) exit 5 ;; esac\n"
+                                  "exec $REAL/rigd-develop \"$@\"\n";
+    const struct raw_dng_info info = raw_info(96, 64);
+    struct json *o;
+    raw_write(scratch_path("a.dng"), &info, raw_scatter, NULL);
+    raw_write(scratch_path("b.dng"), &info, raw_scatter, NULL);
+    raw_write(scratch_path("c.dng"), &info, raw_scatter, NULL);
+    assert_int_equal(run(NULL, "mkdir $D/bin && cp $BIN/rigctl $D/bin"), 0);
+    scratch_write("bin/rigd-develop", program, sizeof(program) - 1);
+    assert_int_equal(run(&o, "chmod +x $D/bin/rigd-develop; REAL=$(cd $BIN && pwd) $D/bin/rigctl develop --half --json -o $D/out $D/?.dng 2>$D/said"), 1);
+    assert_int_equal((int)number(o, "n_developed"), 1);
+    assert_non_null(strstr(text(o, "frames.1.error"), "died: Segmentation fault"));
+    assert_non_null(strstr(text(o, "frames.2.error"), "status 5"));
+    json_free(o);
+    assert_int_equal(run(NULL, "grep -q 'b.dng.*died' $D/said && test -e $D/out/a.exr"), 0);
+    assert_int_equal(run(NULL, "rm -r $D/bin $D/out"), 0);
+    scratch_empty();
+}
+
+static uint16_t grey(void *arg, int x, int y)
+{
+    (void)arg;
+    return (uint16_t)(4000 + (x * 31 + y * 17) % 64);
+}
+
+static void a_worker_takes_less_memory_than_two_frames(void **state)
+{
+    (void)state;
+#if defined(__SANITIZE_ADDRESS__)
+    return; // which takes its own
+#endif
+    const struct raw_dng_info info = raw_info(4000, 3000);
+    struct json *o;
+    raw_write(scratch_path("a.dng"), &info, grey, NULL);
+    assert_int_equal(run(&o, "$BIN/rigd-develop --ahd $D/a.dng $D/a.exr"), 0);
+    assert_true(number(o, "peak_rss_bytes") < 2. * 4000 * 3000 * 6);
+    json_free(o);
+    scratch_empty();
+}
+
+static void the_raw_is_never_overwritten(void **state)
+{
+    (void)state;
+    const struct raw_dng_info info = raw_info(96, 64);
+    raw_write(scratch_path("a.exr"), &info, raw_scatter, NULL);
+    assert_int_equal(run(NULL, "cp $D/a.exr $D/b; ln $D/a.exr $D/c.tif; $BIN/rigctl develop --half -o $D $D/a.exr >/dev/null 2>&1"), 1);
+    assert_int_equal(run(NULL, "$BIN/rigd-develop --half --tiff $D/a.exr $D/c.exr >/dev/null 2>&1"), 1);
+    assert_int_equal(run(NULL, "cmp -s $D/a.exr $D/b"), 0);
     scratch_empty();
 }
 
@@ -530,6 +630,15 @@ static void the_flat_field_of_this_body_and_aperture_is_taken(void **state)
             for (int c = 0; c < 3; c++)
                 assert_true(fabs((double)im.data[(y * im.width + x) * 4 + c] / .4 - 1) < .01);
     image_free(&im);
+    for (int k = 0; k < 2; k++) { // a card in a corner and one in the middle are equally bright with it, not without
+        struct json *middle, *corner;
+        assert_int_equal(run(&middle, "$BIN/rigd-develop --patch 220,160,60,60 %s $D/a.dng", k ? "--flat $D/flat8.dng" : ""), 0);
+        assert_int_equal(run(&corner, "$BIN/rigd-develop --patch 20,20,60,60 %s $D/a.dng", k ? "--flat $D/flat8.dng" : ""), 0);
+        const double ratio = number(corner, "cells.4.mean.1") / number(middle, "cells.4.mean.1");
+        assert_true(k ? fabs(ratio - 1) < .005 : ratio < .85);
+        json_free(middle);
+        json_free(corner);
+    }
     assert_int_equal(run(NULL, "$BIN/rigd-develop --half --flat $D/flat11.dng $D/a.dng $D/b.exr >/dev/null 2>$D/said"), 1);
     assert_int_equal(run(NULL, "grep -q 'no flat field of body 10001.*f/8' $D/said && test ! -e $D/b.exr"), 0);
     scratch_empty();
@@ -595,6 +704,40 @@ static void bodies_with_gains_of_their_own_share_one_space_after_calibration(voi
     scratch_empty();
 }
 
+static void a_chart_seen_by_a_noisy_rig_stays_within_its_bounds(void **state)
+{
+    (void)state;
+    struct scene *scene;
+    struct image im;
+    struct json *o;
+    double published[CHART_COLUMNS * CHART_ROWS][3];
+    colour_chart(published);
+    assert_int_equal(mkdir(scratch_path("chart"), 0777), 0);
+    assert_int_equal(image_new(&im, W, H, 3, NULL), 0);
+    for (int y = 0; y < H; y++)
+        for (int x = 0; x < W; x++) {
+            const int u = (x - 16) * 10, v = (y - 32) * 10; // patches of 80 sites from 16, 32; black borders
+            const bool border = u < 0 || v < 0 || u >= 4800 || v >= 3200 || u % 800 < 60 || u % 800 > 740 || v % 800 < 60 || v % 800 > 740;
+            for (int c = 0; c < 3; c++) // a warm lamp
+                im.data[(y * W + x) * 3 + c] = border ? .02f : (float)(published[v / 800 * CHART_COLUMNS + u / 800][c] * (c == 0 ? .8 : c == 1 ? .7 : .5));
+        }
+    assert_int_equal(image_write_exr(&im, scratch_path("chart/any.exr"), IMAGE_FLOAT, IMAGE_ZIP), 0);
+    image_free(&im);
+    assert_int_equal(scene_open(&scene, scratch_path("chart"), W, H, 1, any_name), 0);
+    for (unsigned b = 0; b < 4; b++) {
+        char name[40];
+        snprintf(name, sizeof(name), "chart%u.dng", b);
+        write_frame(name, scene, b < 2 ? "generic" : "canon", .06, b, 1. / 128, 8, 100); // bodies of two kinds
+    }
+    assert_int_equal(run(&o, "$BIN/rigctl --json calibrate colour --chart 16,32,496,32,496,352,16,352 -o $D/colour.json $D/chart?.dng 2>/dev/null"), 0);
+    assert_true(number(o, "check.grey_spread") < .01);
+    assert_true(number(o, "check.chart_rms_worst") < .03);
+    json_free(o);
+    scene_close(scene);
+    assert_int_equal(run(NULL, "rm -r $D/chart"), 0);
+    scratch_empty();
+}
+
 static void a_clipped_dark_or_shadowed_card_is_refused_by_name(void **state)
 {
     (void)state;
@@ -634,10 +777,15 @@ int main(void)
         cmocka_unit_test(the_picture_carries_its_exposure),
         cmocka_unit_test(a_second_run_makes_what_has_changed_and_nothing_else),
         cmocka_unit_test(a_kill_at_any_time_leaves_whole_files_or_none),
+        cmocka_unit_test(a_killed_run_goes_on_where_it_was),
         cmocka_unit_test(a_bad_frame_is_named_and_the_others_are_done),
+        cmocka_unit_test(a_decoder_that_dies_costs_one_frame_and_is_named),
+        cmocka_unit_test(a_worker_takes_less_memory_than_two_frames),
+        cmocka_unit_test(the_raw_is_never_overwritten),
         cmocka_unit_test(a_body_with_other_settings_is_named),
         cmocka_unit_test(the_flat_field_of_this_body_and_aperture_is_taken),
         cmocka_unit_test(bodies_with_gains_of_their_own_share_one_space_after_calibration),
+        cmocka_unit_test(a_chart_seen_by_a_noisy_rig_stays_within_its_bounds),
         cmocka_unit_test(a_clipped_dark_or_shadowed_card_is_refused_by_name),
     };
     log_set_program("test");

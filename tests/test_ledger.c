@@ -9,6 +9,7 @@
 
 #include <dirent.h>
 #include <errno.h>
+#include <math.h>
 #include <fcntl.h>
 #include <ftw.h>
 #include <setjmp.h>
@@ -232,7 +233,7 @@ static int whole_story(void)
         on_card(&l.camera[i].before[0], i, 1);
     }
     char *text = ledger_text(&l);
-    int err = ledger_create(text, ID, takes);
+    int err = ledger_create(text, TAKE_CAPTURE, ID, takes);
     free(text);
     if (!err)
         err = finish_take(&l);
@@ -429,6 +430,87 @@ static void what_rotted_on_disk_is_noticed_set_aside_and_fetched_again(void **st
     log_set_level(LOG_INFO);
 }
 
+static void exposures_are_called_as_on_dials(void **state)
+{
+    (void)state;
+    static const struct { double seconds; const char *label; double time; } cases[] = {
+        { 1. / 125, "1/125", 0x1p-7 }, { 1. / 60, "1/60", 0x1p-6 }, { 1. / 8000, "1/8000", 0x1p-13 }, { 15, "15", 16 }, { 30, "30", 32 }, { .5, "0.5", .5 },
+        { 1. / 100, "1/100", 0x1p-7 * 1.2599210498948732 }, { 1e-9, "1/8000", 0x1p-13 }, { 1e9, "30", 32 }, { .25, "1/4", .25 }, { 1, "1", 1 }, { 1. / 1000, "1/1000", 0x1p-10 },
+    };
+    for (size_t i = 0; i < sizeof(cases) / sizeof(cases[0]); i++) {
+        char label[16];
+        const double t = ledger_exposure_label(cases[i].seconds, label);
+        assert_string_equal(label, cases[i].label);
+        assert_true(fabs(t / cases[i].time - 1) < 1e-12);
+    }
+    for (int third = -39; third <= 15; third++) { // each is nearest to what its name says
+        char label[16], again[16];
+        double above, below = 1;
+        const double t = ledger_exposure_label(exp2(third / 3.), label);
+        assert_true(sscanf(label, "%lf/%lf", &above, &below) >= 1);
+        assert_true(fabs(log2(above / below / t)) < 1. / 6);
+        assert_true(ledger_exposure_label(above / below, again) == t);
+    }
+}
+
+static void a_panorama_s_ledger_reads_back_as_it_was_written(void **state)
+{
+    (void)state;
+    struct config config;
+    struct ledger l, back;
+    make_config(&config);
+    strcpy(config.panorama.camera_name, config.camera[2].name);
+    config.panorama.camera = 2;
+    config.panorama.n_stops = 2;
+    config.panorama.stop[1] = (struct config_stop){ 120.5, -10 };
+    ledger_init(&l, &config);
+    assert_false(l.camera[2].expected);
+    assert_true(l.camera[1].expected);
+    ledger_free(&l);
+    ledger_init_panorama(&l, &config);
+    strcpy(l.id, ID);
+    l.state = TAKE_EXPOSING;
+    for (int e = 0; e < 3; e++) {
+        struct camera_object o;
+        assert_int_equal(ledger_expose(&l, &config, e > 1, e % 2, exp2(-6 - e)), e);
+        on_card(&o, 1, 100 + e);
+        struct ledger_object *added = ledger_add(&l.camera[e], &o);
+        added->state = OBJECT_COPIED;
+        strcpy(added->xxh128, "0123456789abcdef0123456789abcdef");
+    }
+    assert_string_equal(l.camera[1].name, "00_01");
+    assert_string_equal(l.camera[2].object[0].file, "panorama/raw/01_00.nef");
+    l.camera[0].debt = DEBT_PAID;
+    l.camera[0].exposure.object = 0;
+    l.camera[0].exposure.facts = (struct frame_facts){ 8, 100, "6001", { .exposure_s = 0x1p-6, .n_sites = { 10, 20, 10 }, .n_over = { 1, 2, 3 }, .brightest = { .5, 1, .25 },
+        .first_percentile = { -.001, .002, 0 }, .median = { .1, .2, .3 }, .plateau_dn = 15000 } };
+    l.camera[1].exposure.rejected = true;
+    char *text = ledger_text(&l);
+    assert_int_equal(ledger_parse(&back, text, strlen(text), "t"), 0);
+    assert_int_equal(back.kind, TAKE_PANORAMA);
+    assert_int_equal(back.n_stops, 2);
+    assert_memory_equal(l.stop, back.stop, sizeof(l.stop));
+    assert_memory_equal(l.camera, back.camera, 3 * sizeof(*l.camera));
+    char *again = ledger_text(&back);
+    assert_string_equal(text, again);
+    log_set_level(LOG_SILENT);
+    static const char *const wrong[][2] = { { "\"stop\":1", "\"stop\":2" }, { "panorama/raw/01_00.nef", "raw/01_00.nef" }, { "\"kind\":\"panorama\"", "\"kind\":\"capture\"" },
+        { "\"object\":0", "\"object\":1" }, { "\"brightest\":[0.5", "\"brightest\":[1e300" }, { "\"wanted_s\":", "\"wanted_s\":-" }, { "panorama/raw/01_00.nef", "panorama/raw/../../x" } };
+    for (size_t i = 0; i < sizeof(wrong) / sizeof(wrong[0]); i++) {
+        char bad[20000];
+        const char *at = strstr(text, wrong[i][0]);
+        struct ledger none;
+        if (!at)
+            fail_msg("%s is not in it", wrong[i][0]);
+        snprintf(bad, sizeof(bad), "%.*s%s%s", (int)(at - text), text, wrong[i][1], at + strlen(wrong[i][0]));
+        if (ledger_parse(&none, bad, strlen(bad), "t") != -EINVAL)
+            fail_msg("%s was taken", wrong[i][1]);
+    }
+    log_set_level(LOG_INFO);
+    free(text), free(again);
+    ledger_free(&l), ledger_free(&back);
+}
+
 static void a_ledger_reads_back_as_it_was_written(void **state)
 {
     (void)state;
@@ -501,7 +583,7 @@ static void frames_of_later_takes_are_not_ours(void **state)
         on_card(&l.camera[i].before[0], i, 4);
     strcpy(l.id, "20261122T100000000_later");
     char *later = ledger_text(&l);
-    assert_int_equal(ledger_create(later, l.id, takes), 0);
+    assert_int_equal(ledger_create(later, TAKE_CAPTURE, l.id, takes), 0);
     free(later);
     ledger_free(&l);
     assert_int_equal(ledger_read(&l, take_dir), 0);
@@ -541,6 +623,8 @@ int main(void)
 {
     const struct CMUnitTest tests[] = {
         cmocka_unit_test(a_ledger_reads_back_as_it_was_written),
+        cmocka_unit_test(a_panorama_s_ledger_reads_back_as_it_was_written),
+        cmocka_unit_test(exposures_are_called_as_on_dials),
         cmocka_unit_test(killed_at_every_call_a_take_is_finished_by_the_next_start),
         cmocka_unit_test(a_full_or_failing_disk_costs_no_frame),
         cmocka_unit_test(what_rotted_on_disk_is_noticed_set_aside_and_fetched_again),

@@ -24,7 +24,7 @@ check() { # name, command...
         tail -10 "$D/rigd.log" 2>/dev/null | sed 's/^/#   /'
     fi
 }
-port=$((20000 + $$ % 2000 * 20))
+port=$((10000 + $$ % 1100 * 20))
 cat >"$D/rigd.conf" <<E
 [rig]
 takes = $D/takes

@@ -677,8 +677,8 @@ static void a_frame_follows_time_aperture_iso_and_colour(void **state)
     rig_open(&r, "generic", 0, 5, scratch_dir);
     const struct personality *p = &r.personality;
     const double range = p->white_level - p->black_level;
-    static const struct exposure cases[] = { { 1, 0, 0, 0x1p-7, 8, 100 }, { 2, 0, 0, 0x1p-8, 8, 100 }, { 3, 0, 0, 0x1p-7, 16, 100 },
-                                             { 4, 0, 0, 0x1p-7, 8, 200 }, { 5, 0, 0, 0x1p-9, 8, 400 } };
+    static const struct exposure cases[] = { { .shot = 1, .time_s = 0x1p-7, .f_number = 8, .iso = 100 }, { .shot = 2, .time_s = 0x1p-8, .f_number = 8, .iso = 100 }, { .shot = 3, .time_s = 0x1p-7, .f_number = 16, .iso = 100 },
+                                             { .shot = 4, .time_s = 0x1p-7, .f_number = 8, .iso = 200 }, { .shot = 5, .time_s = 0x1p-9, .f_number = 8, .iso = 400 } };
     for (size_t i = 0; i < sizeof(cases) / sizeof(cases[0]); i++) {
         const struct exposure *e = &cases[i];
         const double k = e->time_s / p->t_ref_s * pow(p->n_ref / e->f_number, 2) * e->iso / 100;
@@ -709,7 +709,7 @@ static void a_raw_clips_at_its_white_level_and_never_wraps(void **state)
     struct rig r;
     flat_folder(1e4f, 1e4f, 0);
     rig_open(&r, "nikon", 0, 5, scratch_dir);
-    double *v = pixels(&r, &(struct exposure){ 1, 0, 0, 1, 1, 6400 });
+    double *v = pixels(&r, &(struct exposure){ .shot = 1, .time_s = 1, .f_number = 1, .iso = 6400 });
     const double top = r.personality.white_level - r.personality.black_level;
     for (int i = 0; i < WIDTH * HEIGHT; i++) {
         const int x = i % WIDTH, y = i / WIDTH;
@@ -732,7 +732,7 @@ static void noise_is_named_by_seed_camera_and_shot(void **state)
     rig_open(&b, "generic", 0, 5, scratch_dir);
     rig_open(&c, "generic", 0, 6, scratch_dir);
     rig_open(&d, "generic", 1, 5, scratch_dir);
-    const struct exposure one = { 1, 0, 0, 0x1p-7, 8, 100 }, two = { 2, 0, 0, 0x1p-7, 8, 100 };
+    const struct exposure one = { .shot = 1, .time_s = 0x1p-7, .f_number = 8, .iso = 100 }, two = { .shot = 2, .time_s = 0x1p-7, .f_number = 8, .iso = 100 };
     double *v[5] = { pixels(&a, &one), pixels(&b, &one), pixels(&c, &one), pixels(&d, &one), pixels(&a, &two) };
     assert_memory_equal(v[0], v[1], WIDTH * HEIGHT * sizeof(double));
     for (int k = 2; k < 5; k++) {

@@ -424,7 +424,8 @@ static void on_broken(void *arg, int err)
     heard.n_broken++;
 }
 
-static const struct trigger_host host = { on_fired, on_feedback, on_button, on_press_camera, on_broken, &heard };
+static const struct trigger_host host = { .fired = on_fired, .feedback = on_feedback, .button = on_button, .press_camera = on_press_camera,
+    .broken = on_broken, .arg = &heard };
 
 static struct trigger_lines *open_fake(int n)
 {
@@ -784,7 +785,7 @@ static void the_simulated_rig_gets_exact_times_and_answers(void **state)
     assert_int_equal(listen(listening, 1), 0);
     assert_int_equal(trigger_open(&t, &config, &host), 0);
     assert_int_equal(trigger_abilities(t), TRIGGER_SYNCHRONISED | TRIGGER_HALF_PRESS | TRIGGER_DELAYS | TRIGGER_FEEDBACK |
-        TRIGGER_RELAYS);
+        TRIGGER_RELAYS | TRIGGER_HEAD);
     const int rigsim = accept(listening, NULL, NULL);
     for (int cut = 1; cut >= 0; cut--) {
         assert_int_equal(trigger_relay(t, 150, cut), 0);

@@ -18,14 +18,17 @@ _rigctl() {
         esac
     done
     case $command in
-    '') mapfile -t COMPREPLY < <(compgen -W "status doctor preflight capture cancel takes report preview resume export calibrate identify reinstate metrics events \
+    '') mapfile -t COMPREPLY < <(compgen -W "status doctor preflight capture continue cancel takes report preview resume export calibrate identify reinstate metrics events \
         panorama develop --socket --json --help --version" -- "$cur") ;;
-    calibrate) mapfile -t COMPREPLY < <(compgen -W "lag colour --shots" -- "$cur") ;;
+    calibrate) mapfile -t COMPREPLY < <(compgen -W "lag colour --shots --patch --chart --places --reference --check --flat -o" -- "$cur") ;;
     identify | reinstate) mapfile -t COMPREPLY < <(compgen -W "$(_rigctl_ask status name)" -- "$cur") ;;
     preview | report | resume | export) mapfile -t COMPREPLY < <(compgen -W "$(_rigctl_ask takes id)" -- "$cur") ;;
     status) mapfile -t COMPREPLY < <(compgen -W "--watch" -- "$cur") ;;
+    panorama) [[ $before == --merge ]] && mapfile -t COMPREPLY < <(compgen -f -W "$(_rigctl_ask takes id)" -- "$cur") ||
+        mapfile -t COMPREPLY < <(compgen -W "--name --merge -o --json" -- "$cur") ;;
     capture) mapfile -t COMPREPLY < <(compgen -W "--name --without-missing" -- "$cur") ;;
-    develop) [[ $cur == -* ]] && mapfile -t COMPREPLY < <(compgen -W "-o --tiff --half" -- "$cur") ;;
+    develop) [[ $cur == -* ]] && mapfile -t COMPREPLY < <(compgen -W "-o --tiff --half --bilinear --ahd --flat --colour --reference-exposure --exposure --saturation \
+        --model --jobs --force --json" -- "$cur") ;;
     esac
 }
 complete -o default -F _rigctl rigctl

@@ -2,11 +2,13 @@
 #include "solver/take/progress.h"
 
 #include <errno.h>
+#include <fcntl.h>
 #include <pthread.h>
 #include <signal.h>
 #include <stdatomic.h>
 #include <stdbool.h>
 #include <stdio.h>
+#include <stdlib.h>
 #include <time.h>
 #include <unistd.h>
 
@@ -15,6 +17,7 @@ static const int64_t REDRAW_NS = 100000000;
 
 static pthread_mutex_t lock = PTHREAD_MUTEX_INITIALIZER;
 static int json_fd = -1;
+static bool asked_environment;
 static bool on_terminal;
 static const char *stage; // NULL: none
 static int64_t total, begin_ns;
@@ -30,6 +33,7 @@ static int64_t now_ns(void)
 void progress_set_fd(int fd)
 {
     pthread_mutex_lock(&lock);
+    asked_environment = true;
     json_fd = fd;
     pthread_mutex_unlock(&lock);
 }
@@ -96,9 +100,20 @@ static void draw(int64_t now)
     fflush(stderr);
 }
 
+// One digit: what rigd gives its programs.
+static int fd_of_environment(void)
+{
+    const char *text = getenv("STUDIORIG_PROGRESS_FD");
+    const bool named = text && text[0] >= '3' && text[0] <= '9' && !text[1];
+    return named && fcntl(text[0] - '0', F_GETFD) >= 0 ? text[0] - '0' : -1;
+}
+
 void progress_begin(const char *name, int64_t n)
 {
     pthread_mutex_lock(&lock);
+    if (!asked_environment)
+        json_fd = fd_of_environment();
+    asked_environment = true;
     stage = name;
     total = n;
     begin_ns = now_ns();

@@ -2,7 +2,7 @@
 //
 // On a terminal: one line on stderr with a bar and the time left, redrawn at most ten times a second.
 // Otherwise: silent, or JSON lines on a descriptor ({"stage":"render","done":12,"total":85,"seconds":3.1}) after
-// progress_set_fd(). Safe from any thread; one stage at a time.
+// progress_set_fd(), or where the environment names one (STUDIORIG_PROGRESS_FD=3: rigd does). Safe from any thread; one stage at a time.
 #pragma once
 #include <stdint.h>
 

@@ -11,7 +11,7 @@
 #include <string.h>
 #include <time.h>
 
-enum { STREAM_BODY_LAG = 0x6c6167, STREAM_SHOT_LAG, STREAM_WIRE_LAG }; // names of random streams (solver/random.h)
+enum { STREAM_BODY_LAG = 0x6c6167, STREAM_SHOT_LAG, STREAM_WIRE_LAG, STREAM_FLICKER }; // names of random streams (solver/random.h)
 enum { HANDLE_DCIM = 0x00010001, HANDLE_FOLDER = 0x00010002, HANDLE_FIRST_FILE = 0x00010010, HANDLE_RAM = 0xffff0001 };
 #define MS 1000000
 #define FIXED_EPOCH_NS (INT64_C(1767225600) * 1000000000) // 2026-01-01T00:00:00
@@ -99,12 +99,15 @@ static int family(enum property_role role)
 static double setting(const struct body *b, int which, double fallback)
 {
     const struct personality *p = b->personality;
-    for (int i = 0; i < p->n_properties; i++)
+    double found = fallback;
+    bool exact = false; // in 0.1 ms, 1/4000 and 1/5000 look alike
+    for (int i = 0; i < p->n_properties && !exact; i++)
         if (family(p->property[i].role) == which) {
             const double v = meaning(p, p->property[i].role, b->value[i]);
-            return v > 0 ? v : fallback;
+            found = v > 0 ? v : fallback;
+            exact = p->property[i].role != ROLE_SHUTTER_100US;
         }
-    return fallback;
+    return found;
 }
 
 int body_iso(const struct body *b)
@@ -319,6 +322,9 @@ static void expose(struct body *b, int64_t at_ns, int64_t lag_ns, uint64_t tag, 
                       .utc_ns = b->fixed_clock ? FIXED_EPOCH_NS + b->n_shots * INT64_C(10000000000) : at_ns + b->utc_offset_ns,
                       .time_s = body_exposure_time_s(b), .f_number = body_f_number(b), .iso = body_iso(b) },
     };
+    p.exposure.view.lamps = fmax(0, 1 + b->faults.flicker * random_normal(b->seed ^ STREAM_FLICKER, b->index, b->n_shots));
+    if (b->aim)
+        b->aim(b->aim_arg, at_ns, &p.exposure.view);
     p.due_ns = at_ns + (int64_t)llround(p.exposure.time_s * 1e9);
     b->ready_ns = p.due_ns + ms_to_ns(b->personality->recycle_ms);
     b->n_in_work++;
@@ -364,6 +370,10 @@ static void line_changes(struct body *b, int line, int level, int64_t at_ns, uin
         body_push_event(b, (struct body_event){ .kind = BODY_STORE_FULL, .at_ns = b->now_ns });
     if (may != PTP_OK)
         return;
+    if (b->faults.closed_shutters) {
+        b->faults.closed_shutters--;
+        return;
+    }
     const int64_t lag = shot_lag_ns(b) + (b->wake_ready_ns > at_ns ? b->wake_ready_ns - at_ns : 0);
     expose(b, at_ns + lag, lag, tag, false);
 }
@@ -401,6 +411,10 @@ uint16_t body_release(struct body *b, bool to_ram)
     const uint16_t may = may_release(b, b->now_ns, to_ram);
     if (may != PTP_OK)
         return may;
+    if (b->faults.closed_shutters) {
+        b->faults.closed_shutters--;
+        return PTP_OK;
+    }
     const struct personality *p = b->personality;
     const double jitter_ms = p->wire_jitter_ms * random_normal(b->seed ^ STREAM_WIRE_LAG, b->index, b->n_shots);
     const int64_t lag = ms_to_ns(fmax(1, p->wire_lag_ms + jitter_ms));

@@ -4,6 +4,7 @@
 // the model there, body_next_ns() says when something will happen by itself. Same seed, index and calls: same answers.
 #pragma once
 #include "tests/rigsim/personality.h"
+#include "tests/rigsim/scene.h"
 
 enum { BODY_OBJECTS_MAX = 9999, BODY_PENDING_MAX = 96, BODY_EVENTS_MAX = 512, BODY_TEXT_MAX = 64 };
 
@@ -24,6 +25,7 @@ struct exposure {
     double time_s;  // true time, a power of two in thirds
     double f_number;
     int iso;
+    struct scene_view view;
 };
 
 struct body_object {
@@ -72,6 +74,8 @@ struct body_faults {
     bool no_power, card_full;
     int lose_object_added, lose_complete; // how many to come
     int corrupt_objects, short_objects;
+    int closed_shutters; // so many releases that expose nothing
+    double flicker;      // sigma of the lamps' brightness from shot to shot, relative
     int64_t late_event_ns; // ObjectAdded and CaptureComplete come this much later
     int late_events;
     uint16_t drift_code; // after it is set next time, it takes drift_value instead
@@ -88,6 +92,8 @@ struct body {
     // The size in bytes of the file (FILES_RAW or FILES_JPEG) that an exposure makes.
     uint64_t (*measure)(void *arg, const struct body *b, const struct exposure *e, int file);
     void *measure_arg;
+    void (*aim)(void *arg, int64_t at_ns, struct scene_view *out); // where it points then; NULL: it is not on a head
+    void *aim_arg;
 
     int64_t now_ns, utc_offset_ns; // UTC by the camera's clock - CLOCK_MONOTONIC
     bool fixed_clock;              // exposures are stamped 10 s apart, whatever the time

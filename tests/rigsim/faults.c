@@ -23,6 +23,7 @@ static const struct {
     { "flood", FAULT_FLOOD, "nt" }, { "card_full", FAULT_CARD_FULL, "" }, { "card_empty_again", FAULT_CARD_EMPTY_AGAIN, "" },
     { "battery", FAULT_BATTERY, "n" }, { "power_cut", FAULT_POWER_CUT, "t" }, { "drift", FAULT_DRIFT, "nn" },
     { "dial", FAULT_DIAL, "nn" }, { "corrupt", FAULT_CORRUPT, "n" }, { "short", FAULT_SHORT, "n" }, { "slow", FAULT_SLOW, "n" },
+    { "flicker", FAULT_FLICKER, "n" }, { "no_shot", FAULT_NO_SHOT, "n" }, { "head_stuck", FAULT_HEAD_STUCK, "n" },
     { "hostile", FAULT_HOSTILE, "hn" },
 };
 static const char *const hostile[] = { "none", "length", "huge", "tiny", "count", "string", "transaction", "type", "total",

@@ -21,6 +21,9 @@
 //          dial 0x5007 560    somebody turns the dial now (an event tells)
 //          corrupt N | short N  the next N files have flipped bytes, or only half their bytes
 //          slow 2000000       bytes per second from now on; 0: no limit
+//          flicker 3          the lamps' brightness differs by that many percent from one exposure of this camera to the next
+//          no_shot N          the next N releases expose nothing
+//          head_stuck N       the next N moves of the panorama head end on the way, and say so (whatever the camera)
 //          hostile KIND N     the next N replies are wrong: length huge tiny count string transaction type total garbage cut
 #pragma once
 #include <stdbool.h>
@@ -30,7 +33,7 @@ enum fault_when { FAULT_AT, FAULT_ON_SHOT, FAULT_ON_OPERATION, FAULT_ON_CONNECT 
 enum fault_kind {
     FAULT_BUSY, FAULT_STALL, FAULT_DROP, FAULT_REFUSE, FAULT_LOSE_ADDED, FAULT_LOSE_COMPLETE, FAULT_LATE, FAULT_FLOOD,
     FAULT_CARD_FULL, FAULT_CARD_EMPTY_AGAIN, FAULT_BATTERY, FAULT_POWER_CUT, FAULT_DRIFT, FAULT_DIAL, FAULT_CORRUPT,
-    FAULT_SHORT, FAULT_SLOW, FAULT_HOSTILE
+    FAULT_SHORT, FAULT_SLOW, FAULT_FLICKER, FAULT_NO_SHOT, FAULT_HEAD_STUCK, FAULT_HOSTILE
 };
 enum hostile_kind { // what is wrong with a reply
     HOSTILE_NONE,

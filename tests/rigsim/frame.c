@@ -20,6 +20,7 @@ struct frame {
     struct raw_dng dng;      // raw
     struct dataset jpeg;     // JPEG
     uint64_t noise_seed;     // of this shot
+    struct scene_view view;
     float electrons[3];      // per scene value 1: R, G, B
     float dn_per_electron, read_variance;
     float black, white;
@@ -53,7 +54,7 @@ static void make_row(struct frame *f, int y)
     const int width = scene_width(f->scene);
     const float k[2] = { f->electrons[y & 1], f->electrons[1 + (y & 1)] };
     const uint64_t row_seed = random_u64(f->noise_seed, STREAM_NOISE, (uint64_t)y);
-    scene_row(f->scene, f->camera, y, f->site);
+    scene_row(f->scene, f->camera, &f->view, y, f->site);
     for (int x = 0; x < width; x += 4) {
         const uint64_t bits = random_mix(row_seed + (uint64_t)x);
         for (int i = 0; i < 4 && x + i < width; i++) {
@@ -111,8 +112,8 @@ static int develop(struct dataset *out, struct scene *scene, const struct body *
     int err = -ENOMEM;
     for (int y = 0; rgb && site && y < height; y++) {
         const int sy = (int)((int64_t)y * sensor_height / height) & ~1;
-        scene_row(scene, b->index, sy, site);
-        scene_row(scene, b->index, sy + 1, site + sensor_width);
+        scene_row(scene, b->index, &e->view, sy, site);
+        scene_row(scene, b->index, &e->view, sy + 1, site + sensor_width);
         for (int x = 0; x < width; x++) {
             const int sx = (int)((int64_t)x * sensor_width / width) & ~1;
             uint8_t *to = rgb + ((size_t)y * (size_t)width + (size_t)x) * 3;
@@ -136,7 +137,7 @@ int frame_open(struct frame **out, struct scene *scene, const struct body *b, co
     if (!f)
         return -ENOMEM;
     pthread_once(&normals_once, make_normals);
-    *f = (struct frame){ .scene = scene, .camera = b->index, .row_y = -1, .black = (float)p->black_level,
+    *f = (struct frame){ .scene = scene, .camera = b->index, .view = e->view, .row_y = -1, .black = (float)p->black_level,
                          .white = (float)p->white_level, .noise_seed = random_u64(b->seed, b->index, e->shot),
                          .read_variance = (float)(p->read_noise_e * p->read_noise_e) };
     f->dn_per_electron = (float)((p->white_level - p->black_level) / p->full_well_e * e->iso / 100);

@@ -1,10 +1,12 @@
 // tests/rigsim/main.c - rigsim's command line.
 #include "solver/take/log.h"
 #include "tests/rigsim/body.h"
+#include "tests/rigsim/probe.h"
 #include "tests/rigsim/server.h"
 
 #include <argp.h>
 #include <errno.h>
+#include <math.h>
 #include <stdio.h>
 #include <stdlib.h>
 #include <string.h>
@@ -19,13 +21,17 @@ static const char doc[] =
     "tests/rigsim/README.md says what is simulated, and how to script faults.";
 
 enum { OPTION_RAW_SIZE = 256, OPTION_SEED, OPTION_FAULTS, OPTION_LIST, OPTION_TRIGGER, OPTION_CLOCK, OPTION_SET, OPTION_PERSONALITY,
-       OPTION_SCENE };
+       OPTION_SCENE, OPTION_PANORAMA, OPTION_PANORAMA_CAMERA, OPTION_PANORAMA_GAIN, OPTION_LENS };
 static const struct argp_option options[] = {
     { "cameras", 'n', "N", 0, "how many, 1 .. 500 (default 1)", 0 },
     { "port", 'p', "P", 0, "first port (default 15740)", 0 },
     { "personality", OPTION_PERSONALITY, "NAME|FILE", 0, "generic (default), nikon, canon, or a file (tests/rigsim/personality.h)", 0 },
     { "set", OPTION_SET, "KEY=VALUE", 0, "change one statement of the personality, e.g. lag_jitter_ms=3", 0 },
     { "scene", OPTION_SCENE, "DIR", 0, "folder of linear EXRs, <camera>.exr (default: a built-in picture)", 0 },
+    { "panorama", OPTION_PANORAMA, "FILE", 0, "latitude-longitude .hdr or .exr: one camera on a motorised head sees this through its lens", 0 },
+    { "panorama-camera", OPTION_PANORAMA_CAMERA, "I", 0, "which camera that is, from 0 (default: the last)", 0 },
+    { "panorama-gain", OPTION_PANORAMA_GAIN, "X", 0, "scene values per radiance of FILE (default 1); 2^-EV for a neutral-density filter", 0 },
+    { "lens", OPTION_LENS, "JSON|FILE", 0, "of that camera (rigd/lens.h; default an equisolid fisheye of 180 degrees across the frame's height)", 0 },
     { "raw-size", OPTION_RAW_SIZE, "WxH", 0, "of the raws, even numbers (default 2448x1632: 8 MB)", 0 },
     { "seed", OPTION_SEED, "S", 0, "of lags and noise (default 0)", 0 },
     { "clock", OPTION_CLOCK, "real|fixed", 0, "fixed: exposures are stamped 10 s apart, so that the same seed gives the same bytes", 0 },
@@ -39,7 +45,7 @@ struct arguments {
     struct server_settings server;
     const char *personality, *faults;
     const char *set[32];
-    int n_set;
+    int n_set, panorama_camera;
     bool list;
 };
 
@@ -75,6 +81,20 @@ static error_t option(int key, char *text, struct argp_state *state)
         return 0;
     case OPTION_SCENE:
         a->server.scene = text;
+        return 0;
+    case OPTION_PANORAMA:
+        a->server.panorama = text;
+        return 0;
+    case OPTION_PANORAMA_CAMERA:
+        a->panorama_camera = (int)number(state, "--panorama-camera", text, 0, SERVER_CAMERAS_MAX - 1);
+        return 0;
+    case OPTION_PANORAMA_GAIN:
+        a->server.panorama_gain = strtod(text, &x);
+        if (!*text || *x || !(a->server.panorama_gain > 0) || !(a->server.panorama_gain < 1e9))
+            argp_error(state, "--panorama-gain: found '%s'; expected a number above 0", text);
+        return 0;
+    case OPTION_LENS:
+        a->server.lens = text;
         return 0;
     case OPTION_RAW_SIZE:
         x = strchr(text, 'x');
@@ -113,10 +133,27 @@ static error_t option(int key, char *text, struct argp_state *state)
     case ARGP_KEY_END:
         if (a->server.port + 2 * (int)a->server.n_cameras - 1 > 65535)
             argp_error(state, "--port %d leaves no room for %u cameras below 65536", a->server.port, a->server.n_cameras);
+        a->server.panorama_camera = a->panorama_camera < 0 ? a->server.n_cameras - 1 : (unsigned)a->panorama_camera;
+        if (a->server.panorama_camera >= a->server.n_cameras)
+            argp_error(state, "--panorama-camera %d: there are %u cameras, from 0", a->panorama_camera, a->server.n_cameras);
+        if (!a->server.panorama && (a->server.lens || a->panorama_camera >= 0))
+            argp_error(state, "--lens and --panorama-camera need --panorama FILE");
         return 0;
     default:
         return ARGP_ERR_UNKNOWN;
     }
+}
+
+// The lens as keys of rigd.conf.
+static void print_panorama(const struct server_settings *s)
+{
+    struct lens l;
+    if (probe_lens(&l, s->lens, s->width_px, s->height_px))
+        return;
+    printf("[panorama]\ncamera = %s\nhead = %s\nlens = %s\nwidth_px = %d\nheight_px = %d\nfocal_px = %.6f\ncentre_px = %.6f, %.6f\n", server_camera_name(s->panorama_camera),
+           s->trigger_socket ? "board" : "manual", lens_model_name(l.model), l.width_px, l.height_px, l.focal_px, l.centre_px[0], l.centre_px[1]);
+    printf("distortion = %.9f, %.9f, %.9f, %.9f, %.9f\ncircle_px = %.6f\nmax_angle_deg = %.6f\nshading = %.9f, %.9f, %.9f\n", l.k[0], l.k[1], l.k[2], l.p[0], l.p[1], l.circle_px,
+           l.max_angle_rad * 180 / M_PI, l.v[0], l.v[1], l.v[2]);
 }
 
 // Sections of rigd.conf; personality: a file of config/cameras/.
@@ -136,12 +173,14 @@ static void print_list(const struct server_settings *s)
         printf("\n");
         body_free(&b);
     }
+    if (s->panorama)
+        print_panorama(s);
 }
 
 int main(int argc, char **argv)
 {
-    struct arguments a = { .server = { .n_cameras = 1, .port = 15740, .width_px = 2448, .height_px = 1632 },
-                           .personality = "generic" };
+    struct arguments a = { .server = { .n_cameras = 1, .port = 15740, .width_px = 2448, .height_px = 1632, .panorama_gain = 1 },
+                           .personality = "generic", .panorama_camera = -1 };
     const struct argp parser = { options, option, NULL, doc, NULL, NULL, NULL };
     struct personality *p = malloc(sizeof(*p));
     struct faults faults = { 0 };
@@ -156,6 +195,12 @@ int main(int argc, char **argv)
     if (err) {
         free(p);
         return 2;
+    }
+    char fisheye[160];
+    if (!a.server.lens) { // 2 f sin(45 degrees) is the image circle's radius
+        snprintf(fisheye, sizeof(fisheye), "{\"model\":\"equisolid\",\"focal_px\":%.3f,\"circle_px\":%.1f,\"max_angle_deg\":90}",
+                 .5 * a.server.height_px / M_SQRT2, .5 * a.server.height_px);
+        a.server.lens = fisheye;
     }
     a.server.personality = p;
     a.server.faults = &faults;

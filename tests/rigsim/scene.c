@@ -1,5 +1,6 @@
 // tests/rigsim/scene.c - see scene.h.
 #include "tests/rigsim/scene.h"
+#include "tests/rigsim/probe.h"
 #include "solver/take/half.h"
 #include "solver/take/image.h"
 #include "solver/take/log.h"
@@ -28,6 +29,8 @@ struct scene {
     uint16_t *plane; // mapped, half: [n_cameras][height][width]
     size_t map_bytes;
     bool *made; // [n_cameras]
+    struct probe *probe;
+    unsigned probe_camera;
 };
 
 // ---- the built-in picture --------------------------------------------------------------------------------------------------
@@ -188,6 +191,7 @@ void scene_close(struct scene *s)
 {
     if (!s)
         return;
+    probe_close(s->probe);
     if (s->plane)
         munmap(s->plane, s->map_bytes);
     if (s->spool_fd >= 0)
@@ -198,8 +202,18 @@ void scene_close(struct scene *s)
     free(s);
 }
 
-void scene_row(struct scene *s, unsigned camera, int y, float *site)
+void scene_give(struct scene *s, unsigned camera, struct probe *probe)
 {
+    s->probe = probe;
+    s->probe_camera = camera;
+}
+
+void scene_row(struct scene *s, unsigned camera, const struct scene_view *view, int y, float *site)
+{
+    if (s->probe && camera == s->probe_camera) {
+        probe_row(s->probe, view, y, site);
+        return;
+    }
     const size_t width = (size_t)s->width;
     if (s->built_in) {
         const size_t shift = (size_t)(camera * 62u) % width & ~(size_t)1; // even: colours stay on their sites

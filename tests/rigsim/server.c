@@ -2,6 +2,7 @@
 #include "tests/rigsim/server.h"
 #include "solver/take/log.h"
 #include "tests/rigsim/server_state.h"
+#include "tests/rigsim/probe.h"
 
 #include <arpa/inet.h>
 #include <errno.h>
@@ -462,6 +463,10 @@ static int open_cameras(struct server *s)
         c->body.fixed_clock = t->fixed_clock;
         c->body.measure = frame_measure;
         c->body.measure_arg = s->scene;
+        if (t->panorama && i == t->panorama_camera) {
+            c->body.aim = server_head_aim;
+            c->body.aim_arg = s;
+        }
         ptp_session_init(&c->session, &c->body);
         c->session.thumbnail = frame_thumbnail;
         c->session.arg = s->scene;
@@ -514,6 +519,12 @@ static int open_server(struct server *s)
     int err = server_watch(s, s->timer, server_name(NAME_TIMER, 0, 0), false, true);
     err = err ? err : server_watch(s, s->signals, server_name(NAME_SIGNALS, 0, 0), false, true);
     err = err ? err : scene_open(&s->scene, t->scene, t->width_px, t->height_px, t->n_cameras, server_camera_name);
+    if (!err && t->panorama) {
+        struct probe *probe;
+        err = probe_open(&probe, t->panorama, t->lens, t->panorama_gain, t->width_px, t->height_px);
+        if (!err)
+            scene_give(s->scene, t->panorama_camera, probe);
+    }
     s->started_ns = s->now_ns = server_now_ns();
     err = err ? err : open_cameras(s);
     return err ? err : server_shutter_open(s);
@@ -540,7 +551,7 @@ static void close_server(struct server *s)
 // Wake when the first body, fault or slow link has something to do.
 static void set_timer(struct server *s)
 {
-    int64_t next = INT64_MAX;
+    int64_t next = server_head_next_ns(s);
     for (unsigned i = 0; i < s->settings->n_cameras; i++) {
         const struct camera *c = &s->camera[i];
         const int64_t body = body_next_ns(&c->body), fault = server_faults_next_ns(c);
@@ -609,6 +620,7 @@ int server_run(const struct server_settings *settings)
             else
                 body_step(&c->body, s.now_ns);
         }
+        server_head_step(&s);
         for (int i = 0; i < n && go_on; i++)
             go_on = handle(&s, &event[i]);
         for (unsigned i = 0; i < settings->n_cameras; i++) {

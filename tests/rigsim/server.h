@@ -14,6 +14,9 @@ struct server_settings {
     const char *scene;       // folder, or NULL
     int width_px, height_px; // of raws
     uint64_t seed;
+    const char *panorama, *lens; // of the panorama camera (probe.h); NULL: none
+    unsigned panorama_camera;
+    double panorama_gain;
     const char *trigger_socket; // shutter_line.h; NULL: none
     bool fixed_clock;
     const struct personality *personality;

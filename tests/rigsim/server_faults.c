@@ -98,6 +98,15 @@ static void begin(struct camera *c, const struct fault *f)
         c->bytes_ahead = 0;
         c->bucket_ns = now;
         return;
+    case FAULT_FLICKER:
+        b->flicker = .01 * (double)(f->n < 100 ? f->n : 100);
+        return;
+    case FAULT_NO_SHOT:
+        b->closed_shutters = (int)f->n;
+        return;
+    case FAULT_HEAD_STUCK:
+        c->server->head.stuck = (int)f->n;
+        return;
     case FAULT_HOSTILE:
         c->hostile = (int)f->n;
         c->n_hostile = (int)f->n2;

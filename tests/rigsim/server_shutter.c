@@ -96,6 +96,12 @@ static void queue(struct shutter_client *client, const struct shutter_line *r)
     client->out[client->n_out++] = *r;
 }
 
+void server_shutter_tell(struct server *s, int client, const struct shutter_line *record)
+{
+    if (s->client[client].fd >= 0)
+        queue(&s->client[client], record);
+}
+
 static int press_one(struct server *s, unsigned camera, const struct shutter_line *r)
 {
     struct camera *c = &s->camera[camera];
@@ -112,8 +118,10 @@ static int press_one(struct server *s, unsigned camera, const struct shutter_lin
     return err;
 }
 
-static int press(struct server *s, const struct shutter_line *r)
+static int obey(struct server *s, int client, const struct shutter_line *r)
 {
+    if (r->kind == SHUTTER_LINE_HEAD)
+        return server_head_move(s, client, r);
     if (r->kind != SHUTTER_LINE_SET || r->line < SHUTTER_LINE_HALF || r->line > SHUTTER_LINE_POWER || r->level > 1 || r->at_ns < 0)
         return -EINVAL;
     if (r->at_ns > s->now_ns + SHUTTER_LINE_HORIZON_NS)
@@ -179,7 +187,7 @@ void server_shutter_ready(struct server *s, unsigned index, bool readable)
         return;
     }
     for (size_t i = 0; i < n_records; i++) {
-        const int err = press(s, &r[i]);
+        const int err = obey(s, (int)index, &r[i]);
         if (err)
             refuse(client, r[i], err);
     }

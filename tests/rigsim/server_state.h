@@ -53,6 +53,16 @@ struct shutter_client {
     size_t n_out, capacity;
 };
 
+// The panorama head: both axes start and arrive together.
+struct head {
+    double from_deg[2], to_deg[2]; // yaw, pitch
+    int64_t began_ns, arrives_ns;  // arrives 0: it stands at to_deg
+    int client;                    // who is told
+    struct shutter_line order;
+    bool fails;                    // it stops half way
+    int stuck;                     // so many moves to come will
+};
+
 struct server {
     const struct server_settings *settings;
     struct scene *scene;
@@ -61,6 +71,7 @@ struct server {
     int64_t started_ns, now_ns;
     int shutter_listener;
     struct shutter_client client[SHUTTER_CLIENTS_MAX];
+    struct head head;
 };
 
 // server.c
@@ -82,7 +93,14 @@ void server_spoil_data(struct camera *c, struct dataset *data);
 bool server_is_stalled(const struct camera *c);
 void server_power(struct camera *c, bool on, int64_t back_ns); // back_ns: when it boots by itself; INT64_MAX never
 
+// server_head.c
+int server_head_move(struct server *s, int client, const struct shutter_line *order); // 0, -EBUSY, -EINVAL
+void server_head_aim(void *arg, int64_t at_ns, struct scene_view *out);               // struct body's aim; arg: the server
+void server_head_step(struct server *s);                                              // tells who is to be told
+int64_t server_head_next_ns(const struct server *s);                                  // INT64_MAX: it stands
+
 // server_shutter.c
+void server_shutter_tell(struct server *s, int client, const struct shutter_line *record);
 int server_shutter_open(struct server *s);
 void server_shutter_close(struct server *s);
 void server_shutter_accept(struct server *s);
