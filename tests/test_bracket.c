@@ -39,7 +39,7 @@ static void merge(struct merged *out, const float *scene, const struct sim_camer
     const struct bracket_options options = options_of(c);
     int64_t ignored[2];
     camera.seed = seed;
-    struct raw_frame f[8];
+    struct raw_frame f[8] = { 0 };
     for (int i = 0; i < n_frames; i++)
         assert_int_equal(sim_expose(f + i, scene, &camera, whole * pow(.25, i), 1, (uint64_t)i), 0);
     assert_int_equal(bracket_new(&b, f, &options), 0);

@@ -1,8 +1,9 @@
 // tests/bench/bench_panorama.c - how near the merged panorama comes to the one that was photographed, beside other ways to merge.
 //
 //   bench_panorama figures PANORAMA...   each through a fisheye of 1, 2, 3, 4 stops and a rectilinear head of 12 stops, CSV on standard output
+//   bench_panorama variance PANORAMA...  of one fisheye stop: error^2 over the Poisson bound and over the bound with read noise, by electrons
 //   bench_panorama frames DIR            24-megapixel frames of one stop and plans of 3 x 7 (fisheye) and 12 x 7 (rectilinear) frames that use them
-//   bench_panorama take PANORAMA DIR     the whole chain: raws of a fisheye of 3 stops and their plan, for rigd-panorama
+//   bench_panorama take PANORAMA DIR     the whole chain: raws of a fisheye of 3 stops and their plan, for rigd-panorama; true.exr: what was photographed
 #include "rigd/stitch.h"
 #include "solver/lights.h"
 #include "solver/take/log.h"
@@ -260,6 +261,34 @@ static void photograph(struct figures out[METHODS], const struct rig *rig, const
         image_free(p + k);
 }
 
+// A synthetic studio's panorama is of point lights, a texel each: no camera resolves that, nor do photosites of a colour add up to it. They
+// are spread over blocks of texels until nearly every block is lit.
+static void spread_points(struct image *p)
+{
+    for (int side = 1; side <= 64; side *= 2) {
+        const int nx = p->width / side, ny = p->height / side;
+        int lit = 0;
+        for (int b = 0; b < nx * ny; b++) {
+            double sum[3] = { 0 }, area = 0;
+            for (int pass = 0; pass < 2; pass++)
+                for (int k = 0; k < side * side; k++) {
+                    const int y = b / nx * side + k / side, x = b % nx * side + k % side;
+                    float *v = p->data + 3 * ((size_t)y * (size_t)p->width + (size_t)x);
+                    const double w = panorama_solid_angle(p->width, p->height, y);
+                    area += pass ? 0 : w;
+                    for (int c = 0; c < 3; c++)
+                        if (pass)
+                            v[c] = (float)(sum[c] / area);
+                        else
+                            sum[c] += w * (double)v[c];
+                }
+            lit += sum[1] > 0;
+        }
+        if (lit > .95 * nx * ny)
+            return;
+    }
+}
+
 static double metered_time(const struct image *p)
 {
     const int n = p->width * p->height;
@@ -280,7 +309,10 @@ static int figures(int n, char **paths)
         struct panorama p;
         struct lights lights;
         const char *name = strrchr(paths[i], '/') ? strrchr(paths[i], '/') + 1 : paths[i];
-        if (panorama_read(&p, paths[i]) || lights_median_cut(&lights, &p, LIGHTS))
+        if (panorama_read(&p, paths[i]))
+            return 1;
+        spread_points(&p.image);
+        if (lights_median_cut(&lights, &p, LIGHTS))
             return 1;
         for (int k = 1; k <= 5; k++) {
             const struct rig rig = k < 5 ? fisheye(k, 1400) : rectilinear(900);
@@ -293,6 +325,67 @@ static int figures(int n, char **paths)
             fflush(stdout);
         }
         lights_free(&lights);
+        panorama_free(&p);
+    }
+    return 0;
+}
+
+// By the electrons that the usable frames have of a site together.
+static int variances(int n_paths, char **paths)
+{
+    enum { CLASSES = 5 };
+    static const double from[CLASSES + 1] = { 100, 300, 1000, 3000, 10000, INFINITY };
+    printf("panorama,electrons_from,sites,over_poisson,over_bound,bias\n");
+    for (int i = 0; i < n_paths; i++) {
+        struct panorama p;
+        const struct rig rig = fisheye(1, 1400);
+        const struct sim_camera *c = &rig.camera;
+        const double w = c->electrons_at_white, dn_e = w / (c->white - c->black), s2 = c->read_noise_e * c->read_noise_e + dn_e * dn_e / 12;
+        const struct bracket_options options = { .noise = { w, sqrt(s2) } };
+        struct raw_frame f[FRAMES_MAX];
+        struct bracket_frame_report report;
+        struct bracket *b;
+        struct merged m;
+        int64_t n_clipped, n_defects;
+        bool needs_nd = false;
+        int metered;
+        if (panorama_read(&p, paths[i]))
+            return 1;
+        spread_points(&p.image);
+        float *seen = sim_see(&p.image, c, 4);
+        const int n = shoot_stop(f, seen, c, metered_time(&p.image), 0, &needs_nd, &metered);
+        if (bracket_new(&b, f, &options))
+            return 1;
+        for (int k = 0; k < n; k++)
+            if (bracket_add(b, f + k, k + 1 < n ? f + k + 1 : NULL, &report))
+                return 1;
+        if (bracket_finish(&m, b, &n_clipped, &n_defects))
+            return 1;
+        double poisson[CLASSES] = { 0 }, bound[CLASSES] = { 0 }, bias[CLASSES] = { 0 };
+        int64_t count[CLASSES] = { 0 };
+        for (int k = 0; k < m.width * m.height; k++) {
+            double exposure = 0, information = 0;
+            const double X = (double)seen[k], e = (double)m.radiance[k] - X;
+            for (int q = 0; q < n; q++) {
+                const double h = bracket_exposure(f + q);
+                if (X * h <= .9)
+                    exposure += h, information += w * w * h * h / (w * X * h + s2);
+            }
+            int class = -1;
+            while (class + 1 < CLASSES && X * exposure * w >= from[class + 1])
+                class++;
+            if (class < 0 || m.quality[k] != BRACKET_GOOD)
+                continue;
+            count[class]++;
+            poisson[class] += e * e * exposure * w / X, bound[class] += e * e * information, bias[class] += e / X;
+        }
+        for (int k = 0; k < CLASSES; k++)
+            printf("%s,%g,%lld,%.4f,%.4f,%+.5f\n", strrchr(paths[i], '/') ? strrchr(paths[i], '/') + 1 : paths[i], from[k], (long long)count[k],
+                   poisson[k] / (double)count[k], bound[k] / (double)count[k], bias[k] / (double)count[k]);
+        for (int k = 0; k < n; k++)
+            free(f[k].site);
+        merged_free(&m);
+        free(seen);
         panorama_free(&p);
     }
     return 0;
@@ -359,7 +452,12 @@ static int take(const char *panorama, const char *dir)
     struct panorama p;
     struct rig rig = fisheye(3, 1400);
     mkdir(dir, 0777);
+    char path_true[1024];
     if (panorama_read(&p, panorama))
+        return 1;
+    spread_points(&p.image);
+    snprintf(path_true, sizeof(path_true), "%s/true.exr", dir);
+    if (image_write_exr(&p.image, path_true, IMAGE_FLOAT, IMAGE_ZIP))
         return 1;
     const double metered_s = metered_time(&p.image);
     FILE *plan = open_plan(dir, "panorama.json");
@@ -395,10 +493,12 @@ int main(int argc, char **argv)
     log_set_level(LOG_ERROR);
     if (argc >= 3 && strcmp(argv[1], "figures") == 0)
         return figures(argc - 2, argv + 2);
+    if (argc >= 3 && strcmp(argv[1], "variance") == 0)
+        return variances(argc - 2, argv + 2);
     if (argc == 3 && strcmp(argv[1], "frames") == 0)
         return frames(argv[2]);
     if (argc == 4 && strcmp(argv[1], "take") == 0)
         return take(argv[2], argv[3]);
-    fprintf(stderr, "usage: bench_panorama figures PANORAMA... | frames DIR | take PANORAMA DIR\n");
+    fprintf(stderr, "usage: bench_panorama figures PANORAMA... | variance PANORAMA... | frames DIR | take PANORAMA DIR\n");
     return 2;
 }

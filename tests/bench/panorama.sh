@@ -5,9 +5,11 @@ set -eu
 out=$1 bin=${BIN:-build/bin} bench=${BENCH:-build/tests/bench/bench_panorama}
 shift
 mkdir -p "$out"
-[ -d "$out/synth" ] || "$bin/rigsolve" synth D3 -o "$out/synth" --size 180x120 --true-lights 4096 --panorama-width 1024 --samples 1 --seed 1
+[ -d "$out/synth" ] || "$bin/rigsolve" synth D3 -o "$out/synth" --size 180x120 --panorama-width 1024 --samples 1 --seed 1
 echo "== radiance, beside hat weights and one exposure ($out/figures.csv)"
 "$bench" figures "$@" | tee "$out/figures.csv"
+echo "== variance"
+"$bench" variance "$@"
 echo "== 24 megapixels"
 "$bench" frames "$out/frames"
 for rig in fisheye rectilinear; do
@@ -18,13 +20,14 @@ for rig in fisheye rectilinear; do
     echo
 done
 echo "== the solver with the true and with the merged panorama"
-rm -rf "$out/take" "$out/merged" "$out/solve-true" "$out/solve-merged"
+rm -rf "$out/take" "$out/merged" "$out/true" "$out/solve-true" "$out/solve-merged"
 "$bench" take "$out/synth/panorama.exr" "$out/take"
 cp -r "$out/synth" "$out/merged"
+cp -r "$out/synth" "$out/true"
+cp "$out/take/true.exr" "$out/true/panorama.exr"
 "$bin/rigd-panorama" "$out/take/panorama.json" -o "$out/merged/panorama.exr" --size 1024
 for which in true merged; do
-    [ $which = true ] && take=$out/synth || take=$out/merged
-    "$bin/rigsolve" solve "$take" -o "$out/solve-$which" --preset preview --seed 1 >/dev/null || [ $? = 3 ]
+    "$bin/rigsolve" solve "$out/$which" -o "$out/solve-$which" --preset preview --seed 1 >/dev/null || [ $? = 3 ]
     printf '%s: ' "$which"
     tr -d '\n' <"$out/solve-$which/report.json" | grep -oE '"(centre_m|world_from_probe)": [^"]*' | tr -s ' \n' ' '
     echo
