@@ -98,8 +98,11 @@ static void on_latch(avr_irq_t *irq, uint32_t value, void *param)
     if (high && !b->latch_high) {
         const uint64_t match = b->timer1->tov_base + b->timer1->comp[AVR_TIMER_COMPA].comp_cycles;
         const bool by_timer = !(b->portb & LATCH) && match <= b->avr->cycle && b->avr->cycle - match < 64;
+        bool press = false; // a release may be armed as late as it likes
+        for (size_t r = 0; r < sizeof(b->chain); r++)
+            press |= (b->chain[r] & ~b->latched[r]) != 0;
         memcpy(b->latched, b->chain, sizeof(b->chain));
-        if (by_timer && match - b->armed < b->margin)
+        if (by_timer && press && match - b->armed < b->margin)
             b->margin = (uint32_t)(match - b->armed);
         show(b, by_timer ? match : b->avr->cycle);
     }
