@@ -461,6 +461,8 @@ static void answer_setup(void)
     UEIENX = 1 << RXSTPE;
     board_unlock(lock);
     is_address_due = false;
+    for (uint8_t i = 0; !(UEINTX & 1 << TXINI) && i < UINT8_MAX; i++) // a few cycles, until the bank is ours
+        ;
     const enum usb_answer answer = usb_setup(setup, tick);
     switch (answer) {
     case USB_STALL:
@@ -482,6 +484,9 @@ static void answer_setup(void)
         UENUM = setup[4] & 7;
         UECONX = 1 << STALLRQC | 1 << RSTDT | 1 << EPEN;
         UENUM = 0;
+        break;
+    case USB_UNCONFIGURED:
+        is_configured = false;
         break;
     case USB_ACK:
     case USB_DATA:

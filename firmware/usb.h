@@ -8,6 +8,7 @@ enum usb_answer {
     USB_ACK,         // done, no data
     USB_ADDRESS,     // acknowledge, then take address setup[2]
     USB_CONFIGURED,  // acknowledge; set up the bulk endpoints
+    USB_UNCONFIGURED, // acknowledge; they are no more
     USB_CLEAR_HALT,  // acknowledge; endpoint setup[4] begins anew with DATA0
 };
 
