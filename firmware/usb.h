@@ -13,5 +13,5 @@ enum usb_answer {
 };
 
 void usb_reset(void);
-// tick: when the SETUP packet came; ours: descriptors fit into one packet of 64.
+// tick: when the SETUP packet came. Every answer fits into one packet of 64 bytes, and never fills it.
 enum usb_answer usb_setup(const uint8_t setup[8], uint64_t tick);

@@ -137,7 +137,7 @@ static void check_on_times(void)
 
 static uint32_t gap_of(int n)
 {
-    return 3400 + 50 * 52 + 72 * (uint32_t)n; // what the capabilities say; a test below compares
+    return 2800 + 50 * 52 + 72 * (uint32_t)n; // what the capabilities say; a test below compares
 }
 
 // ---- frames ---------------------------------------------------------------------------------------------------------------------------
@@ -957,7 +957,8 @@ static void the_head_arrives_exactly_and_within_its_limits(void **state)
         uint16_t speed;
         uint32_t acceleration;
         int32_t to;
-    } moves[] = { { 1000, 2000, 5000 }, { 4000, 1000000, -20000 }, { 4000, 20000, 3 }, { 50, 10, -30 }, { 4000, 1, 40 }, { 1, 1000000, 2 }, { 3000, 500, 1 }, { 4000, 8000, 20000 } };
+    } moves[] = { { 1000, 2000, 5000 }, { 4000, 1000000, -20000 }, { 4000, 20000, 3 }, { 50, 10, -30 }, { 4000, 1, 40 }, { 1, 1000000, 2 },
+        { 3000, 500, 1 }, { 4000, 8000, 20000 } };
     for (size_t i = 0; i < sizeof(moves) / sizeof(*moves); i++) {
         start();
         assert_int_equal(move_to(5, 5), PROTO_ERR_CONFIGURE);
