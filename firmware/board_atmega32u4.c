@@ -246,11 +246,12 @@ ISR(TIMER1_COMPA_vect)
     sequencer_latched();
 }
 
-void board_work_soon(void) // 8 to 24 ticks
+// The flag is cleared first: cleared after, it may be that of this very match, and the next comes a whole beat later.
+void board_work_soon(void) // 16 to 32 ticks
 {
-    const uint8_t at = (uint8_t)(TCNT0 + 2);
-    OCR0B = at > OCR0A ? (uint8_t)(at - OCR0A - 1) : at;
     TIFR0 = 1 << OCF0B;
+    const uint8_t at = (uint8_t)(TCNT0 + 3);
+    OCR0B = at > BOARD_TICKS_PER_BEAT / 8 - 1 ? (uint8_t)(at - BOARD_TICKS_PER_BEAT / 8) : at;
     TIMSK0 |= 1 << OCIE0B;
 }
 
@@ -461,6 +462,8 @@ static void answer_setup(void)
     UEIENX = 1 << RXSTPE;
     board_unlock(lock);
     is_address_due = false;
+    for (uint8_t i = 0; !(UEINTX & 1 << TXINI) && i < UINT8_MAX; i++) // a few cycles, until the bank is ours
+        ;
     const enum usb_answer answer = usb_setup(setup, tick);
     switch (answer) {
     case USB_STALL:
@@ -482,6 +485,9 @@ static void answer_setup(void)
         UENUM = setup[4] & 7;
         UECONX = 1 << STALLRQC | 1 << RSTDT | 1 << EPEN;
         UENUM = 0;
+        break;
+    case USB_UNCONFIGURED:
+        is_configured = false;
         break;
     case USB_ACK:
     case USB_DATA:

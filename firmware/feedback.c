@@ -8,7 +8,7 @@
 
 #include <string.h>
 
-enum { CLOSINGS = 56, CAPTURES = 4 }; // powers of two are not needed: indices wrap by hand
+enum { CLOSINGS = 56, CAPTURES = 4 };
 
 static struct {
     uint8_t n_registers;

@@ -151,6 +151,8 @@ enum {
 // channels, hold after T0 + lead.
 // Outputs with the same delay change on one latch edge. The time from one press edge to the next with n channels is at least
 // gap_base + gap_register * registers + gap_channel * n ticks, or 0 (the same edge); this also holds from T0 to the first channel.
+// T0 must be lead_min_ticks from when the board has checked the shot, and checking 200 channels takes some milliseconds: the host does
+// well to commit 10 ms ahead or more.
 // Longest on-time: lead + last delay + hold for TOGETHER; last delay - first delay + hold for a channel: at most its bank's
 // max_on_ms - PROTO_ON_SLACK_MS.
 enum {
@@ -174,7 +176,7 @@ enum {
     PROTO_HEAD_HOME_POSITIVE = 2,   // home's switch lies on the positive side
     PROTO_HEAD_HOME_ACTIVE_HIGH = 4,
     PROTO_HEAD_HOME_IS_INDEX = 8,   // it is a mark to drive over, not an end stop. Else a move that meets it stops: PROTO_HEAD_BLOCKED
-    PROTO_HEAD_SPEED_MAX = 8000,
+    PROTO_HEAD_SPEED_MAX = 4000,
     PROTO_HEAD_HOMING_STEPS_MAX = 1000000, // given up after: PROTO_HEAD_BLOCKED
 };
 #define PROTO_HEAD_ACCELERATION_MAX UINT32_C(1000000)

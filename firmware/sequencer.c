@@ -319,8 +319,10 @@ static bool plan(void)
     s.next_released = s.released;
     s.next_together_on = s.together_on;
     s.press_edge = press;
-    if (press && release && board_is_before(release_at, press_at)) {
-        const uint32_t room = gap(count_edge(s.released, s.pressed)) + gap(count_edge(s.pressed, s.n));
+    if (press && release && (int32_t)(press_at - release_at) >= (int32_t)(2 * gap(1))) { // else there is no room, and no time to count
+        // What is overdue may be of many delays, and is released all at once.
+        const uint8_t n_released = release_at == now ? (uint8_t)(s.pressed - s.released) : count_edge(s.released, s.pressed);
+        const uint32_t room = gap(n_released) + gap(count_edge(s.pressed, s.n));
         s.press_edge = (int32_t)(press_at - release_at) < (int32_t)room;
     }
     s.edge = s.press_edge ? press_at : release_at;

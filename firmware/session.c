@@ -115,7 +115,7 @@ void session_status(uint8_t out[PROTO_STATUS_BYTES])
     proto_put_u16(out + 38, 0);
 }
 
-// ---- commands: each fills the answer after its first byte, adds to *n, and returns that byte ------------------------------------------
+// ---- commands: each returns the error code, the answer's first byte, and fills what follows it -------------------------------------------
 struct command {
     const uint8_t *in; // payload
     uint8_t n_in;

@@ -123,7 +123,7 @@ static enum usb_answer standard(const uint8_t *s)
             return USB_STALL;
         configuration = s[2];
         session_link_lost(); // whatever was, begins anew
-        return configuration ? USB_CONFIGURED : USB_ACK;
+        return configuration ? USB_CONFIGURED : USB_UNCONFIGURED;
     case GET_INTERFACE:
         return s[0] == 0x81 ? put_all((const uint8_t[]){ 0 }, 1) : USB_STALL;
     case SET_INTERFACE:

@@ -137,7 +137,7 @@ static void check_on_times(void)
 
 static uint32_t gap_of(int n)
 {
-    return 3400 + 50 * 52 + 72 * (uint32_t)n; // what the capabilities say; a test below compares
+    return 3200 + 50 * 52 + 72 * (uint32_t)n; // what the capabilities say; a test below compares
 }
 
 // ---- frames ---------------------------------------------------------------------------------------------------------------------------
@@ -957,7 +957,8 @@ static void the_head_arrives_exactly_and_within_its_limits(void **state)
         uint16_t speed;
         uint32_t acceleration;
         int32_t to;
-    } moves[] = { { 1000, 2000, 5000 }, { 8000, 1000000, -20000 }, { 8000, 20000, 3 }, { 50, 10, -30 }, { 8000, 1, 40 }, { 1, 1000000, 2 }, { 3000, 500, 1 }, { 4000, 8000, 20000 } };
+    } moves[] = { { 1000, 2000, 5000 }, { 4000, 1000000, -20000 }, { 4000, 20000, 3 }, { 50, 10, -30 }, { 4000, 1, 40 }, { 1, 1000000, 2 },
+        { 3000, 500, 1 }, { 4000, 8000, 20000 } };
     for (size_t i = 0; i < sizeof(moves) / sizeof(*moves); i++) {
         start();
         assert_int_equal(move_to(5, 5), PROTO_ERR_CONFIGURE);
@@ -978,8 +979,8 @@ static void the_head_arrives_exactly_and_within_its_limits(void **state)
         assert_int_equal(steps.position[0], moves[i].to);
         assert_int_equal(steps.position[1], -(moves[i].to / 2)); // reversed
         assert_int_equal(steps.n[0], abs(moves[i].to)); // no step there and back
-        // One beat of 1/16000 s is the grain of a step's time; measured speeds are blurred by it.
-        const double v = moves[i].speed, a = moves[i].acceleration, blur = v / 16000;
+        // One beat of 1/8000 s is the grain of a step's time; measured speeds are blurred by it.
+        const double v = moves[i].speed, a = moves[i].acceleration, blur = v / 8000;
         assert_true(steps.fastest[0] <= v * (1 + 2 * blur) + 1);
         // The trapezoid's own time, from below and above.
         const double d = abs(moves[i].to), ideal = d * a > v * v ? d / v + v / a : 2 * sqrt(d / a);

@@ -534,8 +534,8 @@ static void the_head_steps_where_it_is_sent(void **state)
     (void)state;
     for (uint8_t axis = 0; axis < 2; axis++) {
         uint8_t p[PROTO_HEAD_CONFIGURE_BYTES] = { axis, 0 };
-        proto_put_u16(p + 2, 4000);
-        proto_put_u32(p + 4, 40000);
+        proto_put_u16(p + 2, 2000);
+        proto_put_u32(p + 4, 20000);
         proto_put_u16(p + 8, 100);
         proto_put_u32(p + 12, (uint32_t)-5000);
         proto_put_u32(p + 16, 5000);
@@ -552,7 +552,7 @@ static void the_head_steps_where_it_is_sent(void **state)
     assert_int_equal(e.payload[0], PROTO_HEAD_ARRIVED);
     assert_int_equal(seen.position[0], 700);
     assert_int_equal(seen.position[1], -333);
-    assert_true(seen.least_between >= 4000 - 1000 - LATENCY_MAX); // 4000 cycles a step, in beats of 1000, each of which may wait
+    assert_true(seen.least_between >= 8000 - 2000 - LATENCY_MAX); // 8000 cycles a step, in beats of 2000, each of which may wait
     // Home: the switch closes, and opens again on the way back.
     simavr_board_home(board, 0, true);
     assert_int_equal(frames_command(&host, PROTO_HEAD_HOME, (uint8_t[]){ 1, 0 }, 2, NULL), PROTO_OK);
@@ -562,6 +562,35 @@ static void the_head_steps_where_it_is_sent(void **state)
     assert_int_equal(e.payload[0], PROTO_HEAD_ARRIVED);
     assert_int_equal(e.payload[1], 3);
     assert_int_equal(proto_get_i32(e.payload + 2), 0);
+}
+
+static void at_the_heads_top_speed_the_host_is_still_heard(void **state)
+{
+    (void)state;
+    for (uint8_t axis = 0; axis < 2; axis++) {
+        uint8_t p[PROTO_HEAD_CONFIGURE_BYTES] = { axis, 0 };
+        proto_put_u16(p + 2, PROTO_HEAD_SPEED_MAX);
+        proto_put_u32(p + 4, 100000);
+        proto_put_u16(p + 8, 100);
+        proto_put_u32(p + 16, 2000);
+        assert_int_equal(frames_command(&host, PROTO_HEAD_CONFIGURE, p, sizeof(p), NULL), PROTO_OK);
+    }
+    assert_int_equal(frames_command(&host, PROTO_HEAD_HOME, (uint8_t[]){ 3, 1 }, 2, NULL), PROTO_OK);
+    uint8_t to[8];
+    proto_put_u32(to, 2000);
+    proto_put_u32(to + 4, 2000);
+    assert_int_equal(frames_command(&host, PROTO_HEAD_MOVE, to, sizeof(to), NULL), PROTO_OK);
+    struct frames_event e;
+    frames_take(&host, PROTO_HEAD, &e);
+    for (int i = 0; i < 20; i++) {
+        const uint64_t asked = simavr_board_cycle(board);
+        assert_int_equal(frames_command(&host, PROTO_PING, NULL, 0, NULL), PROTO_OK);
+        assert_true(simavr_board_cycle(board) - asked < 10 * MS);
+        simavr_board_run(board, 20 * MS);
+    }
+    assert_true(frames_listen(&host, 1000 * MS, PROTO_HEAD, &e));
+    assert_int_equal(proto_get_i32(e.payload + 6), 2000);
+    assert_int_equal(simavr_board_resets(board), 0);
 }
 
 static void the_stack_leaves_ram(void **state)
@@ -601,6 +630,7 @@ int main(void)
         IN_SIMAVR(a_capture_is_stamped_with_its_cycle),
         IN_SIMAVR(contacts_that_close_are_told_with_their_sample),
         IN_SIMAVR(the_head_steps_where_it_is_sent),
+        IN_SIMAVR(at_the_heads_top_speed_the_host_is_still_heard),
         IN_SIMAVR(the_stack_leaves_ram),
     };
     return cmocka_run_group_tests_name("firmware_avr", tests, NULL, NULL);

@@ -255,7 +255,9 @@ static int bench_bytes(long n_bytes)
     board_sim_start(0);
     board_sim.on_outputs = on_host_outputs;
     host = (struct frames){ .out = sim_out, .in = sim_in, .run = sim_run };
-    const struct frames_config studio = { .n_registers = 52, .n_input_registers = 25, .debounce_ms = 5, .silence_ms = 1000, .n_banks = 1, .bank = { { 0, 416, 1000 } } };
+    const struct frames_config studio = {
+        .n_registers = 52, .n_input_registers = 25, .debounce_ms = 5, .silence_ms = 1000, .n_banks = 1, .bank = { { 0, 416, 1000 } },
+    };
     if (frames_hello(&host) || frames_configure(&host, &studio))
         return 1;
     const double begin = seconds();

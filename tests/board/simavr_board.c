@@ -35,8 +35,8 @@ const char *__lsan_default_suppressions(void)
 }
 
 enum { // data addresses
-    DDRB = 0x24, PORTB = 0x25, PIND = 0x29, PINE = 0x2C, PINF = 0x2F, TIFR0 = 0x35, TIFR1 = 0x36, SPCR = 0x4C, SPSR = 0x4D, SPDR = 0x4E, MCUSR = 0x54, UDCON = 0xE0, UDINT = 0xE1,
-    UDIEN = 0xE2, USBINT = 0xDA, TCCR1A = 0x80,
+    DDRB = 0x24, PORTB = 0x25, PIND = 0x29, PINE = 0x2C, PINF = 0x2F, TIFR0 = 0x35, TIFR1 = 0x36, SPCR = 0x4C, SPSR = 0x4D,
+    SPDR = 0x4E, MCUSR = 0x54, TCCR1A = 0x80, USBCON = 0xD8, USBINT = 0xDA, UDCON = 0xE0, UDINT = 0xE1, UDIEN = 0xE2,
 };
 enum { SPIF = 0x80, SUSPI = 1, DETACH = 1, LED = 1 << 0, LOAD = 1 << 4, LATCH = 1 << 5, ENABLE = 1 << 6, USB_GEN = 10, N_AXES = 2 };
 enum { CONTROL_TIMEOUT = 50 * (SIMAVR_HZ / 1000), POLL_CYCLES = 160 };
@@ -98,8 +98,11 @@ static void on_latch(avr_irq_t *irq, uint32_t value, void *param)
     if (high && !b->latch_high) {
         const uint64_t match = b->timer1->tov_base + b->timer1->comp[AVR_TIMER_COMPA].comp_cycles;
         const bool by_timer = !(b->portb & LATCH) && match <= b->avr->cycle && b->avr->cycle - match < 64;
+        bool press = false; // a release may be armed as late as it likes
+        for (size_t r = 0; r < sizeof(b->chain); r++)
+            press |= (b->chain[r] & ~b->latched[r]) != 0;
         memcpy(b->latched, b->chain, sizeof(b->chain));
-        if (by_timer && match - b->armed < b->margin)
+        if (by_timer && press && match - b->armed < b->margin)
             b->margin = (uint32_t)(match - b->armed);
         show(b, by_timer ? match : b->avr->cycle);
     }
@@ -403,7 +406,7 @@ bool simavr_board_is_dead(const struct simavr_board *b)
 
 bool simavr_board_is_attached(const struct simavr_board *b)
 {
-    return (b->avr->data[0xD8] & 0x80) && !(b->avr->data[UDCON] & DETACH);
+    return (b->avr->data[USBCON] & 0x80) && !(b->avr->data[UDCON] & DETACH);
 }
 
 const uint8_t *simavr_board_outputs(const struct simavr_board *b)

@@ -56,6 +56,6 @@ enum { SIMAVR_VECTORS = 43 };
 const uint32_t *simavr_board_duration(const struct simavr_board *b); // likewise, of the interrupt itself
 void simavr_board_clear_latency(struct simavr_board *b);
 const uint32_t *simavr_board_latency(const struct simavr_board *b);
-// The least time that an edge was armed before it came, since the start or the last clearing: what the firmware has left.
+// The least time that an edge that presses was armed before it came, since the start or the last clearing: what the firmware has left.
 uint32_t simavr_board_margin(const struct simavr_board *b);
 const char *simavr_board_vector_name(int vector);
