@@ -13,7 +13,7 @@ enum {
     BOARD_BEATS_PER_MS = 8,
     BOARD_HEAD_HZ = 16000,       // head_beat()
     // The least time between two latch edges, found by measuring what lies between (tests/test_firmware_avr.c holds them to it).
-    BOARD_GAP_BASE = 2800,
+    BOARD_GAP_BASE = 3400,
     BOARD_GAP_REGISTER = 50,
     BOARD_GAP_CHANNEL = 72,
 };
