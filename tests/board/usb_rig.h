@@ -164,9 +164,10 @@ static inline bool is_on(const uint8_t *outputs, int line)
     return outputs[line / 8] >> line % 8 & 1;
 }
 
+// Of those that are wired: simavr_board.h's chain goes on behind them, and holds what was shifted through.
 static inline bool any_on(const uint8_t outputs[SIMAVR_REGISTERS])
 {
-    for (int i = 0; i < SIMAVR_REGISTERS; i++)
+    for (int i = 0; i < config.trigger.output_registers; i++)
         if (outputs[i])
             return true;
     return false;
