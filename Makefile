@@ -12,7 +12,7 @@ MACHINE := $(shell uname -m)
 
 # ---- packages (Debian 12; the same names in Debian 13) ----------------------------------------------------------------
 PACKAGES := gcc make pkg-config libopenexr-dev libembree-dev libassimp-dev libjansson-dev libtiff-dev libpng-dev libjpeg-dev libexpat1-dev liblapacke-dev libopenblas-dev libcmocka-dev perl help2man dcraw \
-  libgphoto2-dev libgpiod-dev libinih-dev libraw-dev libsystemd-dev libumockdev-dev libusb-1.0-0-dev libxxhash-dev \
+  libgphoto2-dev libgpiod-dev libinih-dev libmicrohttpd-dev libraw-dev libsystemd-dev libumockdev-dev libusb-1.0-0-dev libxxhash-dev \
   gcc-avr avr-libc libsimavr-dev libelf-dev
 PACKAGES_FUZZ := clang libclang-rt-dev
 PACKAGES_BENCH := libceres-dev g++ gnuplot-nox
@@ -40,7 +40,7 @@ RIG_PROGRAMS := rigctl rigd rigd-camera rigd-contact rigd-develop rigd-panorama 
 RIG := $(filter-out $(addprefix rigd/,camera_gphoto.c camera_worker.c contact_main.c daemon.c develop.c develop_main.c main.c panorama_main.c rigctl.c rigctl_develop.c unpack.c),$(wildcard rigd/*.c))
 RIGSIM := $(wildcard tests/rigsim/*.c)
 RIGSIM_LIB := $(filter-out $(addprefix tests/rigsim/,client.c main.c server.c server_faults.c server_head.c server_shutter.c),$(RIGSIM))
-LIBS_RIG = -ljansson -lusb-1.0 -linih -lsystemd -lxxhash -lgpiod -lm
+LIBS_RIG = -ljansson -lusb-1.0 -linih -lsystemd -lxxhash -lgpiod -lmicrohttpd -lm
 LIBS_RAW = -lraw_r -lgomp -lm
 LIBS_CAMERA = -lgphoto2 -lgphoto2_port -ljansson -lxxhash -lm
 FIRMWARE_LOGIC := $(filter-out firmware/main.c firmware/board_%.c,$(wildcard firmware/*.c))
@@ -69,6 +69,7 @@ $(BUILD)/obj/%.o: %.cc Makefile | $(FIRST)
 	@mkdir -p $(@D)
 	@$(if $(V),,echo '  CXX $<')
 	$(Q)$(CXX) -std=c++17 -O3 -g -march=native -I. -I/usr/include/eigen3 -MMD -MP -c $< -o $@
+$(BUILD)/obj/rigd/web.o $(BUILD)/fuzz/obj/rigd/web.o: $(wildcard rigd/web/page.*) # they go into it
 $(BUILD)/obj/solver/kernels/kernels_avx2.o: ISA := $(ISA_avx2)
 $(BUILD)/obj/solver/kernels/kernels_avx512.o: ISA := $(ISA_avx512)
 $(BUILD)/obj/solver/kernels/kernels_%.o: FLAGS_release := -O3 -g
@@ -88,7 +89,7 @@ $(BUILD)/bin/rigsolve: $(call object,$(COMMANDS) solver/main.c) $(BUILD)/libstud
 	@mkdir -p $(@D)
 	@$(if $(V),,echo '  LD $@')
 	$(Q)$(CC) $(CFLAGS_ALL) $^ $(LIBS) -o $@
-link_rig = @mkdir -p $(@D); $(if $(V),,echo '  LD $@';) $(CC) $(CFLAGS_ALL) $^
+link_rig = @mkdir -p $(@D); $(if $(V),,echo '  LD $@';) $(CC) $(CFLAGS_ALL) -Wl,--as-needed $^
 $(BUILD)/bin/rigd: $(call object,rigd/main.c rigd/daemon.c) $(BUILD)/librig.a $(BUILD)/libtake.a
 	$(link_rig) $(LIBS_RIG) -o $@
 $(BUILD)/bin/rigctl: $(call object,rigd/rigctl.c rigd/rigctl_develop.c) $(BUILD)/librig.a $(BUILD)/libtake.a
@@ -128,9 +129,8 @@ $(addprefix $(BUILD)/tests/,$(BOARD_TESTS)) $(BUILD)/tests/board/boardsim: LIBS 
 $(addprefix $(BUILD)/tests/,$(BOARD_TESTS)) $(BUILD)/tests/board/boardsim: | build/firmware/trigger.elf
 $(BUILD)/tests/test_usb_camera $(addprefix $(BUILD)/tests/,$(BOARD_TESTS)): | $(BUILD)/bin/rigd $(BUILD)/bin/rigd-camera
 $(BUILD)/tests/test_pcg: LIBS += $(if $(wildcard /usr/include/suitesparse/cholmod.h),-lcholmod)
-$(BUILD)/tests/test_firmware: $(call object,$(FIRMWARE_SIM) tests/board/frames.c)
-$(BUILD)/tests/test_firmware_avr: $(call object,tests/board/frames.c tests/board/simavr_board.c)
-$(BUILD)/tests/bench/bench_firmware: $(call object,$(FIRMWARE_SIM) tests/board/frames.c tests/board/simavr_board.c)
+$(BUILD)/tests/test_firmware: $(call object,$(FIRMWARE_SIM))
+$(BUILD)/tests/bench/bench_firmware: $(call object,$(FIRMWARE_SIM))
 $(BUILD)/tests/test_firmware_avr $(BUILD)/tests/bench/bench_firmware: LIBS += -lsimavr -lelf
 $(BUILD)/tests/test_firmware_avr $(BUILD)/tests/bench/bench_firmware: | build/firmware/trigger.elf
 $(BUILD)/fuzz/obj/%.o: %.c Makefile | deps-fuzz

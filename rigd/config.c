@@ -3,6 +3,7 @@
 // inih cuts long lines and section names without a word and does not tell line numbers to its handler; the reader below feeds it
 // line by line from memory, so that both are known here.
 #include "rigd/config.h"
+#include "rigd/access.h"
 #include "rigd/stops.h"
 #include "solver/take/atomic_file.h"
 #include "solver/take/log.h"
@@ -18,7 +19,7 @@
 enum { LINE_MAX_BYTES = 196, SECTION_MAX_BYTES = 48, FINDINGS_MAX = 20, LINES_MAX = 4096,
        OUTPUTS_MAX = 416, PRESSES_MAX = 256, INPUTS_MAX = 200, STEPS_MAX = 1000000 }; // of the trigger board (firmware/protocol.h)
 
-enum type { TEXT, PATH, INTEGER, UNSIGNED, NUMBER, BOOL, LINE, PORT, POWER, KIND, NAME, HEAD, MODEL, SECONDS, NUMBERS, STOPS, ON_OFF, DEMOSAIC, THEN };
+enum type { TEXT, PATH, INTEGER, UNSIGNED, NUMBER, BOOL, LINE, PORT, POWER, KIND, NAME, HEAD, MODEL, SECONDS, NUMBERS, STOPS, ON_OFF, DEMOSAIC, THEN, LISTEN };
 
 struct key {
     const char *name;
@@ -76,6 +77,10 @@ static const struct key trigger_keys[] = {
     { "head_yaw_limit_deg", NUMBER, FIELD(trigger_config, head_limit_deg[0]), 0, 720, false },
     { "head_pitch_limit_deg", NUMBER, FIELD(trigger_config, head_limit_deg[1]), 0, 180, false },
     { "head_home_switch", BOOL, FIELD(trigger_config, head_home_switch), 0, 0, false },
+};
+static const struct key web_keys[] = {
+    { "listen", LISTEN, FIELD(config, web.listen), 0, 0, true },
+    { "token_always", BOOL, FIELD(config, web.token_always), 0, 0, false },
 };
 static const struct key develop_keys[] = {
     { "after", ON_OFF, FIELD(process_config, develop), 0, 0, false },
@@ -137,7 +142,7 @@ static const struct key panorama_keys[] = {
 _Static_assert(offsetof(struct lens, p) == offsetof(struct lens, k) + sizeof(((struct lens *)0)->k), "distortion is read as one list");
 #define COUNT(keys) ((int)(sizeof(keys) / sizeof((keys)[0])))
 
-enum section { NO_SECTION, RIG, SETTINGS, CALIBRATION, TRIGGER, PANORAMA, DEVELOP, RECONSTRUCT, SOLVE, CAMERA, BAD_SECTION };
+enum section { NO_SECTION, RIG, SETTINGS, CALIBRATION, TRIGGER, PANORAMA, WEB, DEVELOP, RECONSTRUCT, SOLVE, CAMERA, BAD_SECTION };
 static const struct {
     const char *name;
     const struct key *keys;
@@ -152,6 +157,7 @@ static const struct {
     [RECONSTRUCT] = { "reconstruct", reconstruct_keys, COUNT(reconstruct_keys) },
     [SOLVE] = { "solve", solve_keys, COUNT(solve_keys) },
     [PANORAMA] = { "panorama", panorama_keys, COUNT(panorama_keys) },
+    [WEB] = { "web", web_keys, COUNT(web_keys) },
     [CAMERA] = { "camera", camera_keys, COUNT(camera_keys) },
 };
 
@@ -271,7 +277,7 @@ static void begin_section(struct reader *r, const char *name)
             r->seen_sections |= 1u << s;
             return;
         }
-    complain(r, r->line, "found section [%s], expected [rig], [settings], [trigger], [calibration], [panorama], [develop], [reconstruct], [solve] or [camera \"NAME\"]", name);
+    complain(r, r->line, "found section [%s], expected [rig], [settings], [trigger], [calibration], [panorama], [develop], [reconstruct], [solve], [web] or [camera \"NAME\"]", name);
     r->section = BAD_SECTION;
 }
 
@@ -512,6 +518,16 @@ static const char *set_value(const struct key *key, void *target, const char *va
                 return NULL;
             }
         return "software, gpio, usb or simulated";
+    case LISTEN: {
+        struct listen_address address;
+        if (!strcmp(value, "off"))
+            field[0] = 0;
+        else if (strlen(value) < key->room && !listen_parse(&address, value))
+            memcpy(field, value, strlen(value) + 1);
+        else
+            return "ADDRESS:PORT (127.0.0.1:8420, [::1]:8420; 0.0.0.0:8420 for all addresses), or off";
+        return NULL;
+    }
     case BOOL: {
         const bool yes = !strcmp(value, "yes") || !strcmp(value, "true");
         if (!yes && strcmp(value, "no") && strcmp(value, "false"))

@@ -49,6 +49,11 @@ struct trigger_config {      // [trigger]
     bool head_home_switch;    // yes: it looks for its switches before the first move; no: it stands at home when rigd starts
 };
 
+struct web_config {          // [web], rigd/web.h
+    char listen[64];         // "127.0.0.1:8420", "[::1]:8420"; port 0: any free one; "": no page
+    bool token_always;       // on a loopback address, too; others want it anyway
+};
+
 enum develop_quality { DEVELOP_AHD, DEVELOP_BILINEAR, DEVELOP_HALF };
 enum solve_then { SOLVE_THEN_OFF, SOLVE_THEN_STANDARD, SOLVE_THEN_FINAL };
 
@@ -117,6 +122,7 @@ struct config {
     int calibration_shots;
     double lag_max_std_ms;
     struct trigger_config trigger;
+    struct web_config web;
     struct process_config process;
     struct panorama_config panorama;
     int n_cameras;

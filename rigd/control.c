@@ -203,6 +203,14 @@ static void refuse_line(struct control *c, int i, const char *code, const char *
     json_free(doc);
 }
 
+bool control_has_subscribers(const struct control *c)
+{
+    for (int i = 0; i < CONTROL_CLIENTS_MAX; i++)
+        if (c->client[i].used && c->client[i].subscribed)
+            return true;
+    return false;
+}
+
 void control_publish(struct control *c, const char *event, struct json *body)
 {
     struct json *doc = json_new_object();

@@ -25,6 +25,7 @@ void control_dispatch(struct control *c);
 void control_reply(struct control *c, uint64_t token, struct json *result); // takes result; to a token that was answered: nothing
 // code: a stable word ("busy", "not_ready", "unknown_camera", ...); text for people, with a remedy.
 void control_refuse(struct control *c, uint64_t token, const char *code, const char *text);
+bool control_has_subscribers(const struct control *c);
 void control_publish(struct control *c, const char *event, struct json *body); // to all subscribers; takes body
 
 // For tests and the fuzzer: a client that is not a socket. Feed bytes, take what would be sent (malloc'd, "" if nothing).

@@ -10,12 +10,14 @@
 #undef LOG_WARNING
 
 #include "rigd/daemon.h"
+#include "rigd/changes.h"
 #include "rigd/control.h"
 #include "rigd/describe.h"
 #include "rigd/doctor.h"
 #include "rigd/manifest.h"
 #include "rigd/products.h"
 #include "rigd/rig.h"
+#include "rigd/web.h"
 #include "rigd/workshop.h"
 #include "solver/take/atomic_file.h"
 #include "solver/take/log.h"
@@ -69,6 +71,7 @@ struct job {
     char (*paths)[64];
     char (*hashes)[33];
     uint64_t token;
+    int newest; // so many takes
 };
 
 // Somebody waits for what becomes of a take.
@@ -91,7 +94,10 @@ struct daemon {
     const char *trigger_word;
     struct worker *worker;
     sd_event *event;
-    sd_event_source *timer, *trigger_io, *trigger_timer;
+    sd_event_source *timer, *trigger_io, *trigger_timer, *changes_timer;
+    struct changes *changes;
+    int64_t changes_ns; // when they were last told
+    struct web *web;    // NULL: no page
     struct counters counters;
     int64_t take_began_ns;
     // requests that are answered later
@@ -625,7 +631,9 @@ static void take_is_done(struct daemon *d)
     json_set_number(report, "seconds", seconds);
     log_info("take %s: %s after %.2f s%s%s", l->id, take_state_name(l->state), seconds, l->reason[0] ? ": " : "", l->reason);
     control_reply(d->control, d->resuming ? d->resume_token : d->take_token, report);
-    control_publish(d->control, "take", describe_take(l, false));
+    struct json *ended = describe_take(l, false);
+    json_set_number(ended, "seconds", seconds);
+    control_publish(d->control, "take", ended);
     const bool goes_on = l->state == TAKE_VERIFIED && d->config.process.develop;
     if (goes_on)
         workshop_add(d->workshop, l->id, &(struct workshop_request){ .again = -1 });
@@ -1072,11 +1080,29 @@ static void ask_cancel(struct daemon *d, uint64_t token, const struct json *requ
         control_reply(d->control, token, json_new_object());
 }
 
+static struct json *describe_all_but_cameras(struct daemon *d)
+{
+    struct json *o = describe_rig(d->rig, &d->config, d->trigger_word);
+    char refusal[160] = "";
+    if (d->n_unfinished)
+        snprintf(refusal, sizeof(refusal), "an unfinished take is being collected; wait for it");
+    else if (rig_is_busy(d->rig))
+        snprintf(refusal, sizeof(refusal), "the rig is busy (%s); wait for it", take_state_name(rig_state(d->rig)));
+    else if (!d->trigger)
+        snprintf(refusal, sizeof(refusal), "the trigger is %s: check its cable and power; rigctl doctor says more", d->trigger_word);
+    if (refusal[0])
+        json_set_string(o, "refusal", refusal);
+    json_set(o, "processing", workshop_describe_all(d->workshop));
+    if (d->web)
+        json_set_string(o, "page", web_address(d->web));
+    return o;
+}
+
 static void ask_status(struct daemon *d, uint64_t token, const struct json *request)
 {
-    struct json *o = describe_status(d->rig, &d->config, d->trigger_word);
+    struct json *o = describe_all_but_cameras(d);
     (void)request;
-    json_set(o, "processing", workshop_describe_all(d->workshop));
+    json_set(o, "cameras", describe_cameras(d->rig, &d->config));
     control_reply(d->control, token, o);
 }
 
@@ -1154,7 +1180,7 @@ static void ask_resume(struct daemon *d, uint64_t token, const struct json *requ
 // What only reads the disk is done by its thread, the answer is ready-made.
 static void work_takes(struct job *j)
 {
-    struct json *list = describe_takes(j->dir), *o = json_new_object();
+    struct json *list = describe_takes(j->dir, j->newest), *o = json_new_object();
     json_set(o, "takes", list ? list : json_new_array());
     j->text = json_text(o);
     json_free(o);
@@ -1224,8 +1250,11 @@ static struct job *answer_job(struct daemon *d, uint64_t token, void (*work)(str
 
 static void ask_takes(struct daemon *d, uint64_t token, const struct json *request)
 {
-    (void)request;
-    give(d, answer_job(d, token, work_takes));
+    struct job *j = answer_job(d, token, work_takes);
+    int64_t newest = INT_MAX;
+    json_get_int(request, "newest", &newest);
+    j->newest = newest > 0 && newest < INT_MAX ? (int)newest : INT_MAX;
+    give(d, j);
 }
 
 static void ask_take(struct daemon *d, uint64_t token, const struct json *request, void (*work)(struct job *))
@@ -1458,6 +1487,27 @@ static void obey(struct daemon *d, const struct rig_action *a)
     }
 }
 
+// Those who watch are told what changed, at once or when the last time is CHANGES_EVERY_MS ago.
+static void tell_changes(struct daemon *d)
+{
+    if (!control_has_subscribers(d->control))
+        return;
+    const int64_t now = now_ns(), due = d->changes_ns + CHANGES_EVERY_MS * S / 1000;
+    if (now >= due) {
+        changes_publish(d->changes, d->control, describe_all_but_cameras(d), d->rig, &d->config);
+        d->changes_ns = now;
+    } else {
+        sd_event_source_set_time(d->changes_timer, (uint64_t)(due / 1000 + 1));
+        sd_event_source_set_enabled(d->changes_timer, SD_EVENT_ONESHOT);
+    }
+}
+
+static int on_changes_due(sd_event_source *source, uint64_t usec, void *arg)
+{
+    (void)source, (void)usec, (void)arg; // look_at_rig comes after every event
+    return 0;
+}
+
 // After each event: what the rig wants now, and when it wants to be woken.
 static int look_at_rig(sd_event_source *source, void *arg)
 {
@@ -1477,6 +1527,7 @@ static int look_at_rig(sd_event_source *source, void *arg)
     const int64_t due = rig_deadline_ns(d->rig);
     sd_event_source_set_time(d->timer, due == INT64_MAX ? UINT64_MAX : (uint64_t)(due / 1000 + 1));
     sd_event_source_set_enabled(d->timer, due == INT64_MAX ? SD_EVENT_OFF : SD_EVENT_ONESHOT);
+    tell_changes(d);
     return 0;
 }
 
@@ -1538,6 +1589,8 @@ static int set_up_loop(struct daemon *d)
     if (err >= 0)
         err = sd_event_add_time_relative(d->event, &d->trigger_timer, CLOCK_MONOTONIC, 0, 1, open_the_trigger, d);
     if (err >= 0)
+        err = sd_event_add_time(d->event, &d->changes_timer, CLOCK_MONOTONIC, UINT64_MAX, 1, on_changes_due, d);
+    if (err >= 0)
         err = sd_event_add_io(d->event, NULL, control_fd(d->control), EPOLLIN, on_control, d);
     if (err >= 0)
         err = sd_event_add_io(d->event, NULL, d->finished_fd, EPOLLIN, on_finished, d);
@@ -1583,6 +1636,7 @@ static void end_workers(struct daemon *d)
 
 static void tear_down(struct daemon *d)
 {
+    web_close(d->web);
     end_workers(d);
     sd_event_source_disable_unref(d->trigger_io);
     trigger_close(d->trigger);
@@ -1602,6 +1656,8 @@ static void tear_down(struct daemon *d)
     control_close(d->control);
     sd_event_source_disable_unref(d->timer);
     sd_event_source_disable_unref(d->trigger_timer);
+    sd_event_source_disable_unref(d->changes_timer);
+    changes_free(d->changes);
     sd_event_unref(d->event);
     if (d->finished_fd >= 0)
         close(d->finished_fd);
@@ -1624,6 +1680,8 @@ static int run(struct daemon *d)
         setrlimit(RLIMIT_NOFILE, &files);
     }
     int err = rig_create(&d->rig, &d->config);
+    if (!err)
+        err = changes_create(&d->changes, d->config.n_cameras);
     if (err)
         return err;
     lag_path(d, path, sizeof(path));
@@ -1650,6 +1708,7 @@ static int run(struct daemon *d)
     if (err)
         return err;
     d->disk_runs = true;
+    web_open(&d->web, &d->config); // without it the rig works all the same
     ledger_remove_leftovers(d->takes_dir);
     find_unfinished(d);
     rig_start(d->rig, now_ns());

@@ -1,5 +1,6 @@
 // rigd/describe.c - what clients get to see.
 #include "rigd/describe.h"
+#include "rigd/take_files.h"
 #include "solver/take/log.h"
 
 #include <dirent.h>
@@ -24,7 +25,7 @@ static void put_known(struct json *o, const char *key, int64_t value)
         json_set_int(o, key, value);
 }
 
-static struct json *describe_camera(const struct rig *rig, const struct config *config, int i)
+struct json *describe_camera(const struct rig *rig, const struct config *config, int i)
 {
     const struct rig_camera_view v = rig_camera(rig, i);
     const struct config_camera *c = &config->camera[i];
@@ -56,9 +57,9 @@ static struct json *describe_camera(const struct rig *rig, const struct config *
     return o;
 }
 
-struct json *describe_status(const struct rig *rig, const struct config *config, const char *trigger)
+struct json *describe_rig(const struct rig *rig, const struct config *config, const char *trigger)
 {
-    struct json *o = json_new_object(), *list = json_new_array();
+    struct json *o = json_new_object();
     const struct ledger *l = rig_ledger(rig);
     int n[RIG_QUARANTINED + 1] = { 0 };
     json_set_string(o, "name", config->name);
@@ -69,17 +70,24 @@ struct json *describe_status(const struct rig *rig, const struct config *config,
     put(o, "prompt", rig_prompt(rig));
     json_set_string(o, "trigger", trigger);
     json_set_string(o, "takes_dir", config->takes_dir);
+    if (config_panorama_camera(config) != CONFIG_NONE)
+        json_set_string(o, "panorama_camera", config->panorama.camera_name);
     if (l)
         json_set(o, "take", describe_take(l, false));
-    for (int i = 0; i < config->n_cameras; i++) {
-        json_append(list, describe_camera(rig, config, i));
+    for (int i = 0; i < config->n_cameras; i++)
         n[rig_camera(rig, i).condition]++;
-    }
     json_set_int(o, "n_cameras", config->n_cameras);
     json_set_int(o, "n_ready", n[RIG_READY]);
     json_set_int(o, "n_quarantined", n[RIG_QUARANTINED]);
-    json_set(o, "cameras", list);
     return o;
+}
+
+struct json *describe_cameras(const struct rig *rig, const struct config *config)
+{
+    struct json *list = json_new_array();
+    for (int i = 0; i < config->n_cameras; i++)
+        json_append(list, describe_camera(rig, config, i));
+    return list;
 }
 
 struct json *describe_findings(const struct rig *rig, const struct config *config)
@@ -289,26 +297,35 @@ struct json *describe_progress(const struct ledger *l, const struct rig_progress
     return o;
 }
 
-struct json *describe_takes(const char *takes_dir)
+struct json *describe_takes(const char *takes_dir, int newest)
 {
     struct dirent **entries = NULL;
+    struct json **takes = NULL, *list = NULL;
+    int n_takes = 0;
     const int n = scandir(takes_dir, &entries, NULL, alphasort);
     if (n < 0 && errno != ENOENT) {
         log_error("takes: cannot list %s: %s", takes_dir, strerror(errno));
         return NULL;
     }
-    struct json *list = json_new_array();
-    for (int i = 0; i < n; i++) {
+    takes = calloc((size_t)(n > 0 ? n : 1), sizeof(*takes));
+    for (int i = n - 1; takes && i >= 0 && n_takes < newest; i--) {
         char path[600];
         struct ledger l;
         snprintf(path, sizeof(path), "%s/%s", takes_dir, entries[i]->d_name);
-        if (entries[i]->d_name[0] != '.' && !ledger_read(&l, path)) {
-            json_append(list, describe_take(&l, false));
-            ledger_free(&l);
-        }
-        free(entries[i]);
+        if (entries[i]->d_name[0] == '.' || ledger_read(&l, path))
+            continue;
+        takes[n_takes] = describe_take(&l, false);
+        json_set(takes[n_takes++], "files", take_files_list(path));
+        ledger_free(&l);
     }
+    if (takes)
+        list = json_new_array();
+    for (int i = n_takes - 1; i >= 0; i--)
+        json_append(list, takes[i]);
+    for (int i = 0; i < n; i++)
+        free(entries[i]);
     free(entries);
+    free(takes);
     return list;
 }
 

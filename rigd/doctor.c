@@ -4,6 +4,7 @@
 // together unless told otherwise, and libgphoto2 reads 512 KiB blocks.
 #include "rigd/doctor.h"
 #include "firmware/protocol.h"
+#include "rigd/access.h"
 
 #include <dirent.h>
 #include <errno.h>
@@ -287,6 +288,22 @@ static void check_descriptors(struct examination *x)
         find(x, "error", "descriptors", "at most %ld open files, %ld needed: LimitNOFILE=%ld in the unit", most, needed, 4 * needed);
 }
 
+// Who can press the button in a browser?
+static void check_page(struct examination *x)
+{
+    const struct config *c = x->config;
+    struct listen_address address;
+    if (!c->web.listen[0])
+        return;
+    if (listen_parse(&address, c->web.listen))
+        return; // config.c has looked at it
+    if (!address.is_loopback)
+        find(x, "warning", "page", "%s can be reached from other machines, by those who have the token in %.200s/web-token; nothing is encrypted: keep it in a network of the studio's own, or listen on 127.0.0.1 and use ssh -L",
+             c->web.listen, c->state_dir);
+    else
+        find(x, "info", "page", "%s, for %s on this machine and for nobody outside", c->web.listen, c->web.token_always ? "those who have the token" : "everybody");
+}
+
 struct json *doctor_examine(const struct config *config, const char *root, const char *takes_dir)
 {
     struct examination x = { .config = config, .root = root, .list = json_new_array(), .healthy = true };
@@ -296,6 +313,7 @@ struct json *doctor_examine(const struct config *config, const char *root, const
     check_clock(&x);
     check_disk(&x, takes_dir);
     check_descriptors(&x);
+    check_page(&x);
     struct json *o = json_new_object();
     json_set_bool(o, "healthy", x.healthy);
     json_set(o, "findings", x.list);

@@ -44,7 +44,7 @@ int main(int argc, char **argv)
     static const struct argp argp = {
         option_list, parse, NULL,
         "Fires the cameras of a photogrammetry studio and keeps every frame.\v"
-        "Talk to it with rigctl. A take under way survives any end of this process: the next start finishes it. "
+        "Talk to it with rigctl, or with a browser where the configuration has [web] listen = 127.0.0.1:8420. A take under way survives any end of this process: the next start finishes it. "
         "Exit status: 0 ended when asked to, 1 failed (--once: the take is not verified), 2 usage.",
         NULL, NULL, NULL,
     };

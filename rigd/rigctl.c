@@ -318,6 +318,10 @@ static void print_status(const struct json *s)
         printf("last: %s\n", text_of(s, "outcome"));
     if (text_of(s, "prompt")[0])
         printf("==> %s\n", text_of(s, "prompt"));
+    if (text_of(s, "refusal")[0])
+        printf("a take would be refused: %s\n", text_of(s, "refusal"));
+    if (text_of(s, "page")[0])
+        printf("page: %s\n", text_of(s, "page"));
     printf("%-10s %-12s %-11s %-12s %-20s %5s %6s %8s  %s\n", "camera", "condition", "doing", "serial", "model", "batt", "free", "lag ms", "note");
     for (int i = 0; i < json_length(s, "cameras"); i++) {
         const struct json *c = element(s, "cameras", i);

@@ -44,6 +44,7 @@ only_in inih 'ini\.h' rigd/config.c
 only_in xxHash 'xxhash' rigd/digest.c
 only_in systemd 'systemd/' rigd/daemon.c
 only_in libusb 'libusb' rigd/trigger_usb.c
+only_in libmicrohttpd 'microhttpd' rigd/web.c
 report "no folder or file is called utils or common" "$(find solver rigd firmware tests config -iname '*utils*' -o -iname 'common*' 2>/dev/null)"
 echo "1..$n"
 exit $failed

@@ -270,6 +270,36 @@ static void zero_bytes_and_other_line_ends_are_no_trouble(void **state)
     log_set_level(LOG_INFO);
 }
 
+static void the_page_listens_where_it_is_told_and_nowhere_unasked(void **state)
+{
+    static const char *const right[] = { "127.0.0.1:8420", "0.0.0.0:1", "[::1]:65535", "[::]:0" };
+    static const char *const wrong[] = { "8420", ":8420", "localhost:8420", "127.0.0.1", "127.0.0.1:", "127.0.0.1:65536", "127.0.0.1:8420x", "::1:8420", "[::1]", "[127.0.0.1]:1", "127.1:80", "on", "[::1" };
+    struct config c;
+    char text[300];
+    (void)state;
+    assert_int_equal(parse(&c, HEAD A01), 0);
+    assert_string_equal(c.web.listen, "");
+    config_free(&c);
+    assert_int_equal(parse(&c, HEAD "[web]\nlisten = off\n" A01), 0);
+    assert_string_equal(c.web.listen, "");
+    assert_false(c.web.token_always);
+    config_free(&c);
+    for (size_t i = 0; i < sizeof(right) / sizeof(right[0]); i++) {
+        snprintf(text, sizeof(text), HEAD "[web]\nlisten = %s\ntoken_always = yes\n" A01, right[i]);
+        assert_int_equal(parse(&c, text), 0);
+        assert_string_equal(c.web.listen, right[i]);
+        assert_true(c.web.token_always);
+        config_free(&c);
+    }
+    for (size_t i = 0; i < sizeof(wrong) / sizeof(wrong[0]); i++) {
+        snprintf(text, sizeof(text), HEAD "[web]\nlisten = %s\n" A01, wrong[i]);
+        assert_int_equal(parse(&c, text), -EINVAL);
+        assert_non_null(strstr(said, "rigd.conf:6: listen: found"));
+    }
+    assert_int_equal(parse(&c, HEAD "[web]\n" A01), -EINVAL);
+    assert_non_null(strstr(said, "[web] has no 'listen'"));
+}
+
 int main(void)
 {
     const struct CMUnitTest tests[] = {
@@ -281,6 +311,7 @@ int main(void)
         cmocka_unit_test(the_lines_of_a_board_are_outputs_and_inputs),
         cmocka_unit_test(a_thousand_faults_do_not_fill_the_journal),
         cmocka_unit_test(zero_bytes_and_other_line_ends_are_no_trouble),
+        cmocka_unit_test(the_page_listens_where_it_is_told_and_nowhere_unasked),
     };
     return cmocka_run_group_tests(tests, NULL, NULL);
 }

@@ -122,12 +122,17 @@ static void takes_are_listed_oldest_first_and_what_is_none_is_not(void **state)
     }
     snprintf(path, sizeof(path), "%s/holiday", dir);
     assert_int_equal(make_directories(path), 0);
-    struct json *o = json_new_object(), *list = describe_takes(dir);
+    struct json *o = json_new_object(), *list = describe_takes(dir, 100);
     assert_non_null(list);
     json_set(o, "takes", list);
     assert_int_equal(json_length(o, "takes"), 2);
     assert_string_equal(text(o, "takes.0.id"), ids[1]);
     assert_string_equal(text(o, "takes.1.id"), ids[0]);
+    json_free(o);
+    o = json_new_object();
+    json_set(o, "takes", describe_takes(dir, 1)); // the newest of them
+    assert_int_equal(json_length(o, "takes"), 1);
+    assert_string_equal(text(o, "takes.0.id"), ids[0]);
     json_free(o);
     snprintf(path, sizeof(path), "rm -r %s", dir);
     assert_int_equal(system(path), 0);
@@ -170,7 +175,8 @@ static void status_and_lag_say_only_what_is_known(void **state)
     (void)state;
     const struct lag lag[N] = { { .mean_ms = 97, .std_ms = 1, .error_ms = .2, .n = 30 }, { .mean_ms = 117, .std_ms = 9, .error_ms = 2, .n = 30, .n_rejected = 1 } };
     rig_set_lag(rig, lag);
-    struct json *s = describe_status(rig, &config, "gpio");
+    struct json *s = describe_rig(rig, &config, "gpio");
+    json_set(s, "cameras", describe_cameras(rig, &config));
     assert_string_equal(text(s, "state"), "idle");
     assert_string_equal(text(s, "trigger"), "gpio");
     assert_true(number(s, "n_cameras") == N && number(s, "n_ready") == 0 && number(s, "n_quarantined") == 0);

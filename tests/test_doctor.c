@@ -291,6 +291,28 @@ static void a_disk_that_is_full_or_not_there_is_told(void **state)
     tear_down_machine();
 }
 
+static void a_page_that_others_can_reach_is_told(void **state)
+{
+    (void)state;
+    assert_int_equal(set_up_machine(1, 1), 0);
+    examine();
+    assert_int_equal(n_found(NULL, "page", "", ""), 0); // there is none
+    static const char *const inside[] = { "127.0.0.1:8420", "127.1.2.3:1", "[::1]:8420" }, *const outside[] = { "0.0.0.0:8420", "192.168.1.5:8420", "[::]:8420", "[::2]:8420" };
+    for (int i = 0; i < 3; i++) {
+        strcpy(config.web.listen, inside[i]);
+        examine();
+        assert_int_equal(n_found("info", "page", inside[i], "nobody outside"), 1);
+    }
+    for (int i = 0; i < 4; i++) {
+        strcpy(config.web.listen, outside[i]);
+        strcpy(config.state_dir, "/var/lib/rigd");
+        examine();
+        assert_int_equal(n_found("warning", "page", outside[i], "/var/lib/rigd/web-token"), 1);
+        assert_true(healthy()); // as it was configured
+    }
+    tear_down_machine();
+}
+
 static void this_machine_can_be_looked_at(void **state)
 {
     (void)state;
@@ -325,6 +347,7 @@ int main(void)
         cmocka_unit_test(a_device_that_cannot_be_opened_names_the_rules),
         cmocka_unit_test(the_trigger_board_is_found_or_what_is_in_its_way),
         cmocka_unit_test(a_disk_that_is_full_or_not_there_is_told),
+        cmocka_unit_test(a_page_that_others_can_reach_is_told),
         cmocka_unit_test(this_machine_can_be_looked_at),
     };
     return cmocka_run_group_tests(tests, NULL, NULL);
