@@ -143,7 +143,7 @@ int main(int argc, char **argv)
         cmocka_unit_test_teardown(unplugged_while_armed_is_safe_and_reported_and_heals_when_replugged, close_all),
         cmocka_unit_test_teardown(when_the_host_dies_everything_is_released_within_the_limit, close_all),
     };
-    begin_anew(argv);
+    usbfs_preload(argv);
     if (argc == 2)
         return be_a_host((enum host_state)atoi(argv[1]));
     return run_under_umockdev("board_loss", tests, sizeof(tests) / sizeof(tests[0]));

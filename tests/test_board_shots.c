@@ -253,7 +253,7 @@ int main(int argc, char **argv)
         cmocka_unit_test_teardown(a_supply_comes_back_by_itself, close_all),
         cmocka_unit_test_teardown(the_head_turns_and_knows_its_limits, close_all),
     };
-    begin_anew(argv);
+    usbfs_preload(argv);
     (void)argc;
     return run_under_umockdev("board_shots", tests, sizeof(tests) / sizeof(tests[0]));
 }
