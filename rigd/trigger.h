@@ -51,7 +51,8 @@ int trigger_open(struct trigger **out, const struct config *config, const struct
 unsigned trigger_abilities(const struct trigger *t);
 
 // 0, -ETIME (at_ns - half_ms has passed), -EBUSY (a shot is pending), -EINVAL (hold or a delay beyond its limit, half_ms, the longest
-// delay and hold_ms together beyond max_hold_ms, nobody left to press), -EIO (broken).
+// delay and hold_ms together beyond max_hold_ms, nobody left to press), -EIO (broken),
+// -ENOTSUP (on_button). Takes as long as it takes to load the shot into a board: up to .1 s for 200 cameras.
 int trigger_fire(struct trigger *t, const struct trigger_shot *shot);
 void trigger_release(struct trigger *t); // at once, also in the middle of a shot: fired() then comes with -ECANCELED
 

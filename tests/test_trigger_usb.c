@@ -136,7 +136,7 @@ int main(int argc, char **argv)
         cmocka_unit_test_teardown(a_board_is_chosen_by_its_serial_number, close_all),
         cmocka_unit_test_teardown(whatever_a_board_says_is_refused_by_name_and_hangs_nothing, close_all),
     };
-    begin_anew(argv);
+    usbfs_preload(argv);
     (void)argc;
     return run_under_umockdev("trigger_usb", tests, sizeof(tests) / sizeof(tests[0]));
 }

@@ -210,16 +210,6 @@ static error_t option(int key, char *text, struct argp_state *state)
     }
 }
 
-// umockdev redirects a program from within, and what it starts: this one begins anew with its library loaded first.
-static void begin_anew(char **argv)
-{
-    if (getenv("BOARDSIM_BEGUN"))
-        return;
-    setenv("LD_PRELOAD", "libumockdev-preload.so.0", 1);
-    setenv("BOARDSIM_BEGUN", "1", 1);
-    execv("/proc/self/exe", argv);
-}
-
 // It finds a host that dies within a request worth a word.
 static void ignore(const gchar *domain, GLogLevelFlags level, const gchar *text, gpointer arg)
 {
@@ -234,7 +224,7 @@ int main(int argc, char **argv)
     int status = 1;
     argp_err_exit_status = 2;
     log_set_program("boardsim");
-    begin_anew(argv);
+    usbfs_preload(argv);
     argp_parse(&parser, argc, argv, ARGP_IN_ORDER, NULL, &s);
     if (config_read(&s.config, s.config_path))
         return 2;

@@ -164,9 +164,10 @@ static inline bool is_on(const uint8_t *outputs, int line)
     return outputs[line / 8] >> line % 8 & 1;
 }
 
+// Of those that are wired: simavr_board.h's chain goes on behind them, and holds what was shifted through.
 static inline bool any_on(const uint8_t outputs[SIMAVR_REGISTERS])
 {
-    for (int i = 0; i < SIMAVR_REGISTERS; i++)
+    for (int i = 0; i < config.trigger.output_registers; i++)
         if (outputs[i])
             return true;
     return false;
@@ -228,29 +229,6 @@ static inline int64_t gap_ns(int n_registers, int n_together)
 }
 
 // ---- under the preload -----------------------------------------------------------------------------------------------------------------
-
-// umockdev redirects a program from within: this one begins anew with its library loaded first (second, after the sanitizer's).
-static inline void begin_anew(char **argv)
-{
-    char list[700] = "";
-    if (getenv("TRIGGER_USB_BEGUN"))
-        return;
-#ifdef __SANITIZE_ADDRESS__
-    char line[500];
-    FILE *maps = fopen("/proc/self/maps", "r");
-    while (maps && !list[0] && fgets(line, sizeof(line), maps)) {
-        const char *file = strchr(line, '/');
-        if (file && strstr(file, "/libasan.so"))
-            snprintf(list, sizeof(list), "%.*s:", (int)strcspn(file, "\n"), file);
-    }
-    if (maps)
-        fclose(maps);
-#endif
-    strcat(list, "libumockdev-preload.so.0");
-    setenv("LD_PRELOAD", list, 1);
-    setenv("TRIGGER_USB_BEGUN", "1", 1);
-    execv("/proc/self/exe", argv);
-}
 
 // It finds a host that dies within a request worth a word.
 static inline void ignore(const gchar *domain, GLogLevelFlags level, const gchar *text, gpointer arg)

@@ -31,3 +31,7 @@ void usbfs_free(struct usbfs *u);
 int usbfs_plug(struct usbfs *u, int port, int device_number, const uint8_t *descriptors, size_t n, const char *serial);
 void usbfs_unplug(struct usbfs *u);
 int usbfs_clients(struct usbfs *u); // programs that have it open
+
+// umockdev redirects a program from within, and what that starts: the program begins anew with its library loaded first (second, after
+// the sanitizer's). Returns in the program that has begun anew, or where that is impossible: umockdev_in_mock_environment() tells.
+void usbfs_preload(char **argv);
