@@ -121,7 +121,7 @@ $(BUILD)/tests/test_developing: | $(BUILD)/bin/rigd-develop $(BUILD)/bin/rigctl
 $(BUILD)/tests/test_develop: | $(BUILD)/bin/rigd-unpack
 $(BUILD)/tests/test_develop: $(call object,rigd/develop.c)
 $(BUILD)/tests/test_develop: LIBS += $(LIBS_RAW)
-$(BUILD)/tests/test_rigd_panorama: | $(BUILD)/bin/rigd-panorama
+$(BUILD)/tests/test_rigd_panorama: | $(BUILD)/bin/rigd-develop $(BUILD)/bin/rigd-panorama
 $(BUILD)/tests/bench/stability_joint: $(call object,solver/commands/arguments.c)
 $(addprefix $(BUILD)/obj/tests/,test_usb_camera.o $(addsuffix .o,$(BOARD_TESTS)) usb/usb_camera.o usb/usbfs.o board/fake_board.o board/live_board.o board/boardsim.o): CFLAGS_ALL += $(shell pkg-config --cflags umockdev-1.0 2>/dev/null)
 $(BUILD)/tests/test_usb_camera $(addprefix $(BUILD)/tests/,$(BOARD_TESTS)) $(BUILD)/tests/board/boardsim: LIBS += $(shell pkg-config --libs umockdev-1.0 2>/dev/null)

@@ -1,7 +1,7 @@
 // rigd/bracket.h - one radiance per photosite out of frames of different exposure, before demosaicing; and which exposure comes next.
 //
 // Pure. A frame's signal is y = (DN - black) / (white - black), 1 at the sensor's white; its exposure h = time x ISO / 100 / N^2 (true
-// times: powers of two, not the labels); radiance is y / h, so that frames developed singly and panoramas share a unit.
+// times: powers of two, not the labels); radiance is y / h; times DEVELOP_TIME_S / DEVELOP_F_NUMBER^2 it is in the unit of developed frames.
 //
 // Estimator. A site's electrons are Poisson; with radiance X and frames i, E y_i = X h_i, var y_i = X h_i / w + (s / w)^2, w electrons at
 // white, s electrons of read noise. Without read noise the maximum of the likelihood is sum(y) / sum(h) (Hanji, Zhong, Mantiuk 2020);

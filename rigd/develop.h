@@ -14,6 +14,12 @@
 // Can every photosite be unpacked?
 int develop_check(const char *path, char *why, size_t room);
 
+// The unit of radiance, of frames and panoramas alike: 1 brings the green photosites of a body with gains of 1 to the white level at 1/128 s,
+// f/8, ISO 100.
+#define DEVELOP_TIME_S (1. / 128)
+#define DEVELOP_F_NUMBER 8.
+#define DEVELOP_ISO 100.
+
 enum { RAW_RED, RAW_GREEN, RAW_BLUE };
 
 // One frame as the sensor gave it. Site (x, y) has filter cfa[y & 1][x & 1] and black level black[y & 1][x & 1]; everything that is

@@ -595,7 +595,7 @@ int main(int argc, char **argv)
                               "Exit status: 0 done, 1 failed, 2 usage, 3 done but not to be trusted (the warnings say why).";
     static const struct argp argp = { options, parse_option, "RAW OUT.exr\nRAW --patch X,Y,W,H\nRAW --chart X1,Y1,..,X4,Y4", doc, NULL, NULL, NULL };
     static struct job j;
-    j.a = (struct arguments){ .demosaic = DEMOSAIC_AHD, .reference = { 1. / 128, 8, 100 } };
+    j.a = (struct arguments){ .demosaic = DEMOSAIC_AHD, .reference = { DEVELOP_TIME_S, DEVELOP_F_NUMBER, DEVELOP_ISO } };
     argp_program_version = "rigd-develop " STUDIORIG_VERSION;
     argp_err_exit_status = EXIT_USAGE;
     log_set_program("rigd-develop");

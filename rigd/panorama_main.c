@@ -387,6 +387,7 @@ static int do_stop(struct job *j, struct stitch *stitch, const struct panorama_s
 static int colour_matrix(struct job *j, double M[9])
 {
     const struct panorama_plan *p = &j->plan;
+    const double unit = DEVELOP_TIME_S * DEVELOP_ISO / 100 / (DEVELOP_F_NUMBER * DEVELOP_F_NUMBER); // h at which 1 is white
     double gains[3] = { p->gains[0], p->gains[1], p->gains[2] }, scale = p->scale;
     if (p->colour_file) {
         struct colour c;
@@ -408,7 +409,7 @@ static int colour_matrix(struct job *j, double M[9])
         find(j, DOUBT, "no_matrix", NULL, NULL, "no colour matrix is known for %s: R, G, B are the camera's own; give \"srgb_from_camera\" in the plan", j->reference.model);
     for (int i = 0; i < 3; i++)
         for (int k = 0; k < 3; k++)
-            M[3 * i + k] = scale * gains[k] * j->reference.daylight[k] * (p->has_matrix ? p->srgb_from_camera[3 * i + k] : j->reference.srgb_from_camera[i][k]);
+            M[3 * i + k] = unit * scale * gains[k] * j->reference.daylight[k] * (p->has_matrix ? p->srgb_from_camera[3 * i + k] : j->reference.srgb_from_camera[i][k]);
     return 0;
 }
 
@@ -466,7 +467,7 @@ static int write_panorama(const struct job *j, struct image *p)
         names[c] = p->names[c];
     const struct image_rows rows = { .width = p->width, .height = p->height, .n_channels = p->n_channels, .names = names, .row = row_of, .arg = p };
     const struct image_note notes[] = { { .name = "nodalOffsetM", .number = j->plan.nodal_offset_m },
-                                        { .name = "radianceUnit", .text = "(DN - black) / (white - black) / (seconds x ISO / 100 / N^2), x gains x scale" } };
+                                        { .name = "radianceUnit", .text = "1 is white at 1/128 s, f/8, ISO 100, x gains x scale" } };
     return image_write_exr_rows(&rows, notes, j->plan.n_stops ? 2 : 0, j->output, IMAGE_FLOAT, IMAGE_PIZ);
 }
 

@@ -14,6 +14,8 @@ static const double label_s[FRAMES] = { 8, 2, .5, 1. / 8, 1. / 30, 1. / 125, 1. 
 static const double true_s[FRAMES] = { 8, 2, .5, 1. / 8, 1. / 32, 1. / 128, 1. / 512, 1. / 2048, 1. / 2048 };
 enum { START = 1700000000 };
 
+// What is simulated has the unit y / h of bracket.h; files have that of developed frames.
+static const double unit = DEVELOP_TIME_S * DEVELOP_ISO / 100 / (DEVELOP_F_NUMBER * DEVELOP_F_NUMBER);
 static struct sim_camera camera;
 static struct image truth;
 static float *seen[STOPS];
@@ -170,7 +172,7 @@ static double median_error(const struct image *p)
     for (int i = 0; i < WIDTH * WIDTH / 2; i++) {
         const float *v = p->data + (size_t)i * (size_t)p->n_channels;
         if (v[coverage] > .99f && v[1] > 10 * sqrtf(v[variance]))
-            error[n++] = fabs((double)v[1] / (double)small.data[3 * i + 1] - 1);
+            error[n++] = fabs((double)v[1] / (unit * (double)small.data[3 * i + 1]) - 1);
     }
     image_free(&small);
     assert_true(n > WIDTH * WIDTH / 2 * 9 / 10);
@@ -184,7 +186,7 @@ static double total_error(const struct image *p)
     panorama_total(&(struct panorama){ truth }, real);
     for (int i = 0; i < WIDTH * WIDTH / 2; i++)
         ours += (double)p->data[(size_t)i * (size_t)p->n_channels + 1] * panorama_solid_angle(WIDTH, WIDTH / 2, i / WIDTH);
-    return ours / real[1] - 1;
+    return ours / (unit * real[1]) - 1;
 }
 
 static void a_plan_without_fault_gives_the_radiance_and_no_doubt(void **state)
@@ -209,6 +211,43 @@ static void a_plan_without_fault_gives_the_radiance_and_no_doubt(void **state)
     assert_float_equal(x / camera.electrons_at_white, 1, .1);
     assert_int_equal(json_get_number(report, "nodal_offset_m", &x), 0);
     assert_true(x == .003);
+}
+
+// Developed alone, a frame of the first stop shows what the panorama shows there.
+static void a_frame_and_the_panorama_share_a_unit(void **state)
+{
+    (void)state;
+    struct image p, frame;
+    char command[3000];
+    const char *bin = getenv("BIN");
+    static double ratio[SIZE * SIZE];
+    int n = 0;
+    assert_int_equal(run_with(&none), 0);
+    // 8 s: white is 1e-3, and half floats have steps of 6e-8
+    snprintf(command, sizeof(command), "%s/rigd-develop --bilinear '%s' '%s' >'%s' 2>&1", bin ? bin : "build/bin", scratch_path("s0_0.dng"), scratch_path("frame.exr"), scratch_path("log"));
+    assert_int_equal(system(command), 0);
+    assert_int_equal(image_read(&p, scratch_path("panorama.exr")), 0);
+    assert_int_equal(image_read(&frame, scratch_path("frame.exr")), 0);
+    assert_true(frame.width == SIZE && frame.height == SIZE);
+    for (int y = 0; y < SIZE; y++)
+        for (int x = 0; x < SIZE; x++) {
+            const float *v = frame.data + ((size_t)y * SIZE + (size_t)x) * (size_t)frame.n_channels;
+            const double px[2] = { x + .5, y + .5 };
+            double d[3], R[9], probe[3], u, w;
+            if (!lens_ray(&camera.lens, px, d) || v[1] < 1e-5f || v[1] > 8e-4f)
+                continue;
+            lens_head(R, 0, 0, 0);
+            mat3_mul_vec(probe, R, d);
+            panorama_pixel(p.width, p.height, probe, &u, &w);
+            ratio[n++] = (double)p.data[((size_t)fmin(w, p.height - 1) * (size_t)p.width + (size_t)u) * (size_t)p.n_channels + 1] / (double)v[1];
+        }
+    assert_true(n > 1000);
+    qsort(ratio, (size_t)n, sizeof(*ratio), compare);
+    if (getenv("VERBOSE"))
+        fprintf(stderr, "panorama over frame: median %.4f of %d pixels\n", ratio[n / 2], n);
+    assert_float_equal(ratio[n / 2], 1, .05);
+    image_free(&p);
+    image_free(&frame);
 }
 
 static void a_clipped_light_is_declared(void **state)
@@ -394,6 +433,7 @@ int main(void)
 {
     const struct CMUnitTest tests[] = {
         cmocka_unit_test(a_plan_without_fault_gives_the_radiance_and_no_doubt),
+        cmocka_unit_test(a_frame_and_the_panorama_share_a_unit),
         cmocka_unit_test(a_clipped_light_is_declared),
         cmocka_unit_test(missing_stops_and_frames_are_named),
         cmocka_unit_test(a_wrong_order_is_named),
