@@ -13,7 +13,7 @@ enum {
     BOARD_BEATS_PER_MS = 8,
     BOARD_HEAD_HZ = 8000,        // head_beat(): two axes in one beat take up to 1,200 ticks
     // The least time between two latch edges, found by measuring what lies between (tests/test_firmware_avr.c holds them to it).
-    BOARD_GAP_BASE = 3200,
+    BOARD_GAP_BASE = 4400,
     BOARD_GAP_REGISTER = 50,
     BOARD_GAP_CHANNEL = 72,
 };

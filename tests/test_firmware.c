@@ -137,7 +137,7 @@ static void check_on_times(void)
 
 static uint32_t gap_of(int n)
 {
-    return 3200 + 50 * 52 + 72 * (uint32_t)n; // what the capabilities say; a test below compares
+    return 4400 + 50 * 52 + 72 * (uint32_t)n; // what the capabilities say; a test below compares
 }
 
 // ---- frames ---------------------------------------------------------------------------------------------------------------------------
