@@ -163,7 +163,7 @@ ISR(TIMER1_OVF_vect)
 }
 
 // ---- outputs ----------------------------------------------------------------------------------------------------------------------------
-static void spi_wait(void) // 16 cycles a byte: what can be done meanwhile is done before
+static inline __attribute__((always_inline)) void spi_wait(void) // 16 cycles a byte: what can be done meanwhile is done before
 {
     while (!(SPSR & 1 << SPIF))
         ;
@@ -278,20 +278,13 @@ void board_sample(uint8_t *inputs, uint8_t n_inputs, const uint8_t *outputs, uin
         spi_wait();
         *inputs++ = SPDR;
     }
-    const uint8_t *p = outputs + n_outputs;
-    SPDR = *--p;
-    uint8_t n = n_inputs;
-    while (n-- > 0) {
-        const uint8_t next = p > outputs ? *--p : 0;
+    n_outputs = (uint8_t)(n_outputs - n_inputs);
+    for (const uint8_t *p = outputs + n_outputs + n_inputs; n_inputs > 0; n_inputs--) {
+        SPDR = *--p;
         spi_wait();
         *inputs++ = SPDR;
-        if (n > 0 || n_outputs > n_inputs)
-            SPDR = next;
     }
-    if (n_outputs > n_inputs)
-        spi_wait();
-    if (n_outputs > n_inputs + 1)
-        board_shift(outputs, (uint8_t)(n_outputs - n_inputs - 1));
+    board_shift(outputs, n_outputs);
 }
 
 bool board_button_high(void)

@@ -40,6 +40,8 @@ static struct {
     struct channel channel[PROTO_CHANNELS_MAX];
     uint8_t n, n_loaded, flags, state, banks_channels, banks_together; // banks: bit per bank used
     bool any_together;
+    uint8_t crowd, edge_first;    // first channel of an edge too close to the one before (UINT8_MAX: none); of the edge loaded last
+    uint32_t edge_gap;            // from the one before that
     uint16_t shot;
     uint32_t lead, hold;
     uint64_t t0;                  // state WAITING, RUNNING; ARMED: ticks from the press
@@ -105,6 +107,7 @@ uint8_t sequencer_begin(uint16_t shot, uint8_t flags, uint8_t n_channels, uint32
     s.banks_channels = s.banks_together = 0;
     s.n = n_channels;
     s.n_loaded = 0;
+    s.crowd = UINT8_MAX;
     s.flags = flags;
     s.shot = shot;
     s.lead = lead;
@@ -146,6 +149,23 @@ static bool is_channel(uint16_t output, uint8_t n)
     return false;
 }
 
+// The channel loaded last: is its edge far enough from the one before, with all the channels it has by now? The first edge of all
+// has lead_min_ticks instead.
+static void check_gap(void)
+{
+    const uint8_t i = (uint8_t)(s.n_loaded - 1);
+    const uint32_t at = s.lead + delay_of(i);
+    if (i == 0) {
+        s.edge_first = 0;
+        s.edge_gap = s.any_together && at > 0 ? at : UINT32_MAX;
+    } else if (!same_delay(i, (uint8_t)(i - 1))) {
+        s.edge_first = i;
+        s.edge_gap = at - (s.lead + delay_of((uint8_t)(i - 1)));
+    }
+    if (s.crowd == UINT8_MAX && s.edge_gap < gap((uint8_t)(s.n_loaded - s.edge_first)))
+        s.crowd = s.edge_first;
+}
+
 uint8_t sequencer_channels(uint8_t first_entry, const uint8_t *entries, uint8_t n, uint16_t *wrong)
 {
     if (s.state != PROTO_SHOT_LOADING)
@@ -169,6 +189,7 @@ uint8_t sequencer_channels(uint8_t first_entry, const uint8_t *entries, uint8_t 
         c->output = output;
         s.banks_channels |= bit_of[bank];
         s.n_loaded++;
+        check_gap();
     }
     return PROTO_OK;
 }
@@ -184,33 +205,14 @@ static bool is_any_on(void)
     return false;
 }
 
-// Each edge must be far enough from the one before to be prepared in between. Returns the first channel that is not, or n.
-static uint8_t find_crowd(void)
-{
-    uint32_t before = 0;         // of the edge before, after T0
-    bool first = !s.any_together; // the first edge has lead_min_ticks instead
-    for (uint8_t i = 0, in_edge; i < s.n; i = (uint8_t)(i + in_edge)) {
-        in_edge = 1;
-        while (in_edge < s.n - i && same_delay(i, (uint8_t)(i + in_edge)))
-            in_edge++;
-        const uint32_t at = s.lead + delay_of(i);
-        if (!first && at != before && at - before < gap(in_edge))
-            return i;
-        before = at;
-        first = false;
-    }
-    return s.n;
-}
-
 uint8_t sequencer_commit(uint16_t shot, uint64_t when, uint16_t *wrong)
 {
     if (is_committed())
         return PROTO_ERR_BUSY;
     if (s.state != PROTO_SHOT_LOADING || shot != s.shot || s.n_loaded != s.n || (s.n == 0 && !s.any_together))
         return PROTO_ERR_INCOMPLETE;
-    const uint8_t crowd = find_crowd();
-    if (crowd < s.n) {
-        *wrong = crowd;
+    if (s.crowd < s.n) {
+        *wrong = s.crowd;
         return PROTO_ERR_GAP;
     }
     const uint32_t last = s.n ? delay_of((uint8_t)(s.n - 1)) : 0, first = s.n ? delay_of(0) : 0;

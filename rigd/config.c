@@ -16,7 +16,8 @@
 #include <string.h>
 #include <unistd.h>
 
-enum { LINE_MAX_BYTES = 196, SECTION_MAX_BYTES = 48, FINDINGS_MAX = 20, LINES_MAX = 4096 };
+enum { LINE_MAX_BYTES = 196, SECTION_MAX_BYTES = 48, FINDINGS_MAX = 20, LINES_MAX = 4096,
+       OUTPUTS_MAX = 416, PRESSES_MAX = 256, INPUTS_MAX = 200, STEPS_MAX = 1000000 }; // of the trigger board (firmware/protocol.h)
 
 enum type { TEXT, PATH, INTEGER, UNSIGNED, NUMBER, BOOL, LINE, PORT, POWER, KIND, NAME, HEAD, MODEL, SECONDS, NUMBERS, STOPS, ON_OFF, DEMOSAIC, THEN, LISTEN };
 
@@ -67,6 +68,15 @@ static const struct key trigger_keys[] = {
     { "half_press_ms", UNSIGNED, FIELD(trigger_config, half_press_ms), 0, 5000, false },
     { "hold_ms", UNSIGNED, FIELD(trigger_config, hold_ms), 1, 10000, false },
     { "max_hold_ms", UNSIGNED, FIELD(trigger_config, max_hold_ms), 1, 10000, false },
+    { "serial", NAME, FIELD(trigger_config, serial), 0, 0, false },
+    { "output_registers", INTEGER, FIELD(trigger_config, output_registers), 1, OUTPUTS_MAX / 8, false },
+    { "head_yaw_steps_per_turn", INTEGER, FIELD(trigger_config, head_steps_per_turn[0]), -STEPS_MAX, STEPS_MAX, false },
+    { "head_pitch_steps_per_turn", INTEGER, FIELD(trigger_config, head_steps_per_turn[1]), -STEPS_MAX, STEPS_MAX, false },
+    { "head_deg_per_s", NUMBER, FIELD(trigger_config, head_deg_per_s), .1, 360, false },
+    { "head_deg_per_s2", NUMBER, FIELD(trigger_config, head_deg_per_s2), .1, 3600, false },
+    { "head_yaw_limit_deg", NUMBER, FIELD(trigger_config, head_limit_deg[0]), 0, 720, false },
+    { "head_pitch_limit_deg", NUMBER, FIELD(trigger_config, head_limit_deg[1]), 0, 180, false },
+    { "head_home_switch", BOOL, FIELD(trigger_config, head_home_switch), 0, 0, false },
 };
 static const struct key web_keys[] = {
     { "listen", LISTEN, FIELD(config, web.listen), 0, 0, true },
@@ -166,6 +176,7 @@ struct reader {
     int section_line;
     uint32_t seen;          // keys of the present section
     uint32_t seen_sections; // except cameras
+    uint32_t trigger_seen;  // keys of [trigger]
     int camera_line[CONFIG_CAMERAS_MAX];
     int panorama_line;
     int trigger_line, hold_line; // of [trigger]; of the last of half_press_ms, hold_ms and max_hold_ms, else of [trigger]
@@ -175,7 +186,7 @@ struct reader {
 
 __attribute__((format(printf, 3, 4))) static void complain(struct reader *r, int line, const char *format, ...)
 {
-    char text[400];
+    char text[500];
     va_list args;
     if (r->n_findings++ >= FINDINGS_MAX)
         return;
@@ -194,6 +205,7 @@ static void check_section_end(struct reader *r)
 {
     if (r->section == NO_SECTION || r->section == BAD_SECTION)
         return;
+    r->trigger_seen |= r->section == TRIGGER ? r->seen : 0;
     for (int k = 0; k < sections[r->section].n_keys; k++)
         if (sections[r->section].keys[k].required && !(r->seen >> k & 1))
             complain(r, r->section_line, "[%s] has no '%s'; add a line '%s = ...'", sections[r->section].name, sections[r->section].keys[k].name, sections[r->section].keys[k].name);
@@ -544,6 +556,11 @@ static const char *set_value(const struct key *key, void *target, const char *va
             memcpy(field, &none, sizeof(none));
             return NULL;
         }
+        if (!strcmp(value, "capture") && !strcmp(key->name, "feedback_line")) {
+            const int capture = CONFIG_CAPTURE;
+            memcpy(field, &capture, sizeof(capture));
+            return NULL;
+        }
         if (!to_number(value, &n) || n < 0 || n >= LINES_MAX || n != (int)n)
             return "a line's number, or none";
         const int line = (int)n;
@@ -669,7 +686,7 @@ static int take_line(void *arg, const char *section, const char *name, const cha
             complain(r, r->line, "%s: found '%s', expected %s", name, value, expected);
         return 1;
     }
-    char known[300] = "";
+    char known[400] = "";
     for (int k = 0, n = 0; k < sections[r->section].n_keys && n < (int)sizeof(known) - 30; k++)
         n += snprintf(known + n, sizeof(known) - (size_t)n, "%s%s", k ? ", " : "", sections[r->section].keys[k].name);
     complain(r, r->line, "[%s] knows no '%s'; it knows %s", sections[r->section].name, name, known);
@@ -699,7 +716,7 @@ static void merge_settings(struct reader *r)
             }
 }
 
-// GPIO lines are one row of numbers; a board and the simulated rig have a row for each purpose.
+// GPIO lines are one row of numbers; a board has outputs and inputs, and the simulated rig a row for each purpose.
 struct use {
     int line;
     const char *purpose;
@@ -710,14 +727,52 @@ static void use_line(struct reader *r, struct use *uses, int *n, int line, const
 {
     if (line == CONFIG_NONE)
         return;
-    struct use u = { .line = line, .purpose = r->config->trigger.kind == TRIGGER_GPIO ? "any" : what };
+    const enum trigger_kind kind = r->config->trigger.kind;
+    const bool is_input = !strcmp(what, "feedback_line");
+    struct use u = { .line = line, .purpose = kind == TRIGGER_GPIO ? "any" : kind == TRIGGER_USB ? (is_input ? "input" : "output") : what };
     snprintf(u.what, sizeof(u.what), "%s%.23s%s%s", camera[0] ? "camera " : "", camera, camera[0] ? "'s " : "[trigger] ", what);
     for (int i = 0; i < *n; i++)
         if (uses[i].line == line && !strcmp(uses[i].purpose, u.purpose)) {
-            complain(r, at, "line %d is %s already, it cannot be %s too", line, uses[i].what, u.what);
+            if (line == CONFIG_CAPTURE)
+                complain(r, at, "the capture input is %s already, it cannot be %s too", uses[i].what, u.what);
+            else
+                complain(r, at, "line %d is %s already, it cannot be %s too", line, uses[i].what, u.what);
             return;
         }
     uses[(*n)++] = u;
+    if (line == CONFIG_CAPTURE && kind != TRIGGER_USB)
+        complain(r, at, "%s = capture: only kind = usb has that input", u.what);
+    if (kind != TRIGGER_USB || !r->config->trigger.output_registers)
+        return;
+    const int n_outputs = 8 * r->config->trigger.output_registers;
+    if (is_input && line >= INPUTS_MAX)
+        complain(r, at, "%s: found %d, expected 0 to %d or capture: the board has no more inputs", u.what, line, INPUTS_MAX - 1);
+    else if (!is_input && line >= n_outputs)
+        complain(r, at, "%s: found %d, expected 0 to %d: output_registers = %d is %d outputs", u.what, line, n_outputs - 1, n_outputs / 8, n_outputs);
+    else if (!strcmp(what, "full_line") && line >= PRESSES_MAX)
+        complain(r, at, "%s: found %d, expected 0 to %d: outputs behind these cannot be pressed at a time of their own; half_line and relay_line may", u.what, line, PRESSES_MAX - 1);
+}
+
+static bool is_said(const struct reader *r, const char *trigger_key)
+{
+    for (int k = 0; k < COUNT(trigger_keys); k++)
+        if (!strcmp(trigger_keys[k].name, trigger_key))
+            return r->trigger_seen >> k & 1;
+    return false;
+}
+
+static void check_board(struct reader *r)
+{
+    struct trigger_config *t = &r->config->trigger;
+    if (!t->output_registers)
+        complain(r, r->trigger_line, "[trigger] kind = usb needs 'output_registers = ' with the number of shift registers in the board's chain (8 outputs each)");
+    if (t->button_line != CONFIG_NONE)
+        complain(r, r->trigger_line, "[trigger] kind = usb has a button input of its own; remove button_line");
+    if (t->active_low)
+        complain(r, r->trigger_line, "[trigger] kind = usb presses with a 1 in its registers; remove active_low, and invert behind them if you must");
+    // Its inputs are pulled up: contacts to ground are the rule.
+    t->button_active_low = t->button_active_low || !is_said(r, "button_active_low");
+    t->feedback_active_low = t->feedback_active_low || !is_said(r, "feedback_active_low");
 }
 
 static void check_lines(struct reader *r)
@@ -741,10 +796,12 @@ static void check_lines(struct reader *r)
         use_line(r, uses, &n, k->feedback_line, k->name, "feedback_line", r->camera_line[i]);
         use_line(r, uses, &n, k->relay_line, k->name, "relay_line", r->camera_line[i]);
         half |= t->kind != TRIGGER_SOFTWARE && k->half_line != CONFIG_NONE;
-        if (t->kind == TRIGGER_GPIO && k->full_line == CONFIG_NONE && t->full_line == CONFIG_NONE && i != config_panorama_camera(c))
+        if ((t->kind == TRIGGER_GPIO || t->kind == TRIGGER_USB) && k->full_line == CONFIG_NONE && t->full_line == CONFIG_NONE && i != config_panorama_camera(c))
             complain(r, r->camera_line[i], "camera \"%s\" has no full_line and [trigger] has none for all; nothing would press it", k->name);
     }
     free(uses);
+    if (t->kind == TRIGGER_USB)
+        check_board(r);
     if (t->kind == TRIGGER_GPIO && !t->chip[0])
         complain(r, r->trigger_line, "[trigger] kind = gpio needs 'chip = gpiochip0' or another (gpiodetect lists them)");
     if (t->kind == TRIGGER_SIMULATED && !t->address[0])
@@ -835,6 +892,10 @@ static void set_defaults(struct config *c)
     t->half_press_ms = 500;
     t->hold_ms = 150;
     t->max_hold_ms = 2000;
+    t->head_deg_per_s = 30;
+    t->head_deg_per_s2 = 60;
+    t->head_limit_deg[0] = 180;
+    t->head_limit_deg[1] = 90;
     struct process_config *made = &c->process;
     made->develop_timeout_s = 300;
     made->panorama_timeout_s = 1800;

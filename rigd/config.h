@@ -7,7 +7,7 @@
 #include "rigd/camera.h"
 #include "rigd/lens.h"
 
-enum { CONFIG_CAMERAS_MAX = 256, CONFIG_NONE = -1, CONFIG_STOPS_MAX = 64, CONFIG_FRAMES_MAX = 32 };
+enum { CONFIG_CAMERAS_MAX = 256, CONFIG_NONE = -1, CONFIG_CAPTURE = -2, CONFIG_STOPS_MAX = 64, CONFIG_FRAMES_MAX = 32 };
 
 struct config_camera {       // [camera "A01"]
     char name[24];           // letters, digits, - and _: it names files
@@ -17,7 +17,7 @@ struct config_camera {       // [camera "A01"]
     char personality[256];   // path of NAME.conf: in personality_dir, else in cameras/ beside rigd.conf, else as installed; "" none
     char lens[64];           // as the body reports it, "": not checked
     int full_line, half_line; // trigger channels of this body alone; CONFIG_NONE: it hangs on the common lines
-    int feedback_line;       // flash-sync input; CONFIG_NONE
+    int feedback_line;       // flash-sync input; CONFIG_NONE; CONFIG_CAPTURE: the board's exact one ("capture", kind = usb)
     int relay_line;          // output that cuts its supply when set; CONFIG_NONE
     char power[48];          // "1-4:3": hub and port that can switch its USB power; ""
     int controller;          // bodies with the same number share one USB controller (the slot's bus + 1; PTP/IP: 0)
@@ -39,6 +39,14 @@ struct trigger_config {      // [trigger]
     uint32_t half_press_ms;  // half-press before full-press; 0: no half-press
     uint32_t hold_ms;        // full-press
     uint32_t max_hold_ms;    // no line stays pressed longer, whatever anyone asks; at most 10000
+    // usb. Lines are the outputs of the board's chain of registers, 8 each, number 0 next to the board; feedback lines its inputs.
+    char serial[40];         // of the board; "": the only one
+    int output_registers;    // wired: fewer would leave the last ones with what was shifted through them
+    // The panorama head's motors, yaw and pitch. steps_per_turn 0: none; negative: wired the other way round.
+    int head_steps_per_turn[2];
+    double head_deg_per_s, head_deg_per_s2;
+    double head_limit_deg[2]; // either way from home
+    bool head_home_switch;    // yes: it looks for its switches before the first move; no: it stands at home when rigd starts
 };
 
 struct web_config {          // [web], rigd/web.h

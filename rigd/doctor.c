@@ -3,6 +3,7 @@
 // Figures from RIG.md 1: a PTP camera takes 4 endpoints of the 96 that common controllers have; usbfs gives 16 MB to all devices
 // together unless told otherwise, and libgphoto2 reads 512 KiB blocks.
 #include "rigd/doctor.h"
+#include "firmware/protocol.h"
 #include "rigd/access.h"
 
 #include <dirent.h>
@@ -101,7 +102,9 @@ static void check_usbfs(struct examination *x)
         find(x, "info", "usbfs", "usbfs_memory_mb %d, %d needed", have_mb, needed_mb);
 }
 
-struct slot { // what hangs in a camera's port
+enum { BOARD_SLOT = CONFIG_CAMERAS_MAX, N_SLOTS }; // after the cameras'
+
+struct slot { // what hangs in a camera's port, or is the trigger board
     char device[40]; // "/dev/bus/usb/001/017"; "": nothing, or no USB camera
     int holder;      // process that has it open; 0: none, or none that we may look at
 };
@@ -116,7 +119,7 @@ static void look_at_descriptors(const struct examination *x, int pid, struct slo
         if (n < 0)
             continue;
         target[n] = 0;
-        for (int i = 0; i < x->config->n_cameras && !strncmp(target, "/dev/bus/usb/", 13); i++)
+        for (int i = 0; i < N_SLOTS && !strncmp(target, "/dev/bus/usb/", 13); i++)
             if (!strcmp(target, slots[i].device))
                 slots[i].holder = pid;
     }
@@ -163,19 +166,84 @@ static void check_port(struct examination *x, const struct config_camera *c, str
         find(x, "error", about, "%s: %s: install rigd's udev rules, and let rigd's user be in group plugdev", slot->device, strerror(errno));
 }
 
+static bool read_attribute(const struct examination *x, const char *device, const char *name, char *out, size_t room)
+{
+    char path[200];
+    snprintf(path, sizeof(path), "/sys/bus/usb/devices/%.60s/%s", device, name);
+    out[0] = 0;
+    return read_line(x, path, out, room);
+}
+
+static unsigned hexadecimal(const struct examination *x, const char *device, const char *name)
+{
+    char text[20];
+    return read_attribute(x, device, name, text, sizeof(text)) ? (unsigned)strtoul(text, NULL, 16) : 0;
+}
+
+static void check_this_board(struct examination *x, const char *device, const char *serial, struct slot *slot)
+{
+    char number[20], full[700];
+    const unsigned version = hexadecimal(x, device, "bcdDevice");
+    read_attribute(x, device, "busnum", number, sizeof(number));
+    const int bus = atoi(number);
+    read_attribute(x, device, "devnum", number, sizeof(number));
+    snprintf(slot->device, sizeof(slot->device), "/dev/bus/usb/%03d/%03d", bus, atoi(number));
+    snprintf(full, sizeof(full), "%s%.39s", x->root, slot->device);
+    if (access(full, R_OK | W_OK))
+        find(x, "error", "trigger board", "%s: %s: install rigd's udev rules, let rigd's user be in group plugdev, and plug the board in again", slot->device, strerror(errno));
+    else if (version >> 8 != PROTO_VERSION >> 8)
+        find(x, "error", "trigger board", "board %s at USB %s speaks protocol %x.%x, this rigd %x.%x: flash the firmware that came with it (firmware/README.md)", serial, device, version >> 8, version & 255,
+             PROTO_VERSION >> 8, PROTO_VERSION & 255);
+    else
+        find(x, "info", "trigger board", "board %s at USB %s, firmware's protocol %x.%x", serial, device, version >> 8, version & 255);
+}
+
+static void check_board(struct examination *x, struct slot *slot)
+{
+    char path[600], serial[80], maker[60], product[60], others[200] = "";
+    const char *wanted = x->config->trigger.serial;
+    int n_found = 0;
+    snprintf(path, sizeof(path), "%s/sys/bus/usb/devices", x->root);
+    DIR *d = opendir(path);
+    for (const struct dirent *e; d && (e = readdir(d));) {
+        if (hexadecimal(x, e->d_name, "idVendor") != PROTO_VENDOR_ID || hexadecimal(x, e->d_name, "idProduct") != PROTO_PRODUCT_ID)
+            continue;
+        read_attribute(x, e->d_name, "serial", serial, sizeof(serial));
+        read_attribute(x, e->d_name, "manufacturer", maker, sizeof(maker));
+        read_attribute(x, e->d_name, "product", product, sizeof(product));
+        if (strcmp(maker, PROTO_MANUFACTURER) || strcmp(product, PROTO_PRODUCT) || (wanted[0] && strcmp(serial, wanted))) {
+            const size_t at = strlen(others);
+            snprintf(others + at, sizeof(others) - at, "%s%.40s (%.40s %.40s) at %.20s", at ? ", " : "", serial, maker, product, e->d_name);
+            continue;
+        }
+        n_found++;
+        check_this_board(x, e->d_name, serial, slot);
+    }
+    if (d)
+        closedir(d);
+    if (!n_found && others[0])
+        find(x, "error", "trigger board", "no board %s; plugged in: %s: correct [trigger] serial", wanted, others);
+    else if (!n_found)
+        find(x, "error", "trigger board", "none is plugged in (USB %04x:%04x): look at its cable and its LED", PROTO_VENDOR_ID, PROTO_PRODUCT_ID);
+    else if (n_found > 1)
+        find(x, "error", "trigger board", "%d are plugged in: name one by [trigger] serial", n_found);
+}
+
 static void check_ports(struct examination *x)
 {
-    struct slot slots[CONFIG_CAMERAS_MAX] = { 0 };
+    struct slot slots[N_SLOTS] = { 0 };
+    if (x->config->trigger.kind == TRIGGER_USB)
+        check_board(x, &slots[BOARD_SLOT]);
     for (int i = 0; i < x->config->n_cameras; i++)
         if (!strncmp(x->config->camera[i].port, "usb:", 4))
             check_port(x, &x->config->camera[i], &slots[i]);
     find_holders(x, slots);
-    for (int i = 0; i < x->config->n_cameras; i++) {
+    for (int i = 0; i < N_SLOTS; i++) {
         char about[40], path[60], name[60] = "?";
         snprintf(path, sizeof(path), "/proc/%d/comm", slots[i].holder);
         if (!slots[i].holder || (read_line(x, path, name, sizeof(name)) && !strncmp(name, "rigd", 4)))
             continue;
-        snprintf(about, sizeof(about), "camera %s", x->config->camera[i].name);
+        snprintf(about, sizeof(about), "%s%s", i == BOARD_SLOT ? "trigger board" : "camera ", i == BOARD_SLOT ? "" : x->config->camera[i].name);
         find(x, "error", about, "%s is held by %s (process %d): stop it; rigd's udev rules keep the desktop away", slots[i].device, name, slots[i].holder);
     }
 }

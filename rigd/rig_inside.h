@@ -22,7 +22,7 @@ enum {
     TRIES_MAX = 3, DISK_TRIES_MAX = 10, COMMIT_TRIES_MAX = 30, FIRE_TRIES_MAX = 3,
     AWAKE_HALF_PRESS_MS = 150, DRIVER_PRESS_MS = 8000, // of the panorama camera
     TURN_MS = 60000, TURN_TRIES_MAX = 3, // a head takes so long at most
-    FIRE_LEAD_MS = 30,        // from the decision to half-press
+    FIRE_LEAD_MS = 150,       // from the decision to half-press: the board is told of each body first, 200 of them in some 60 ms
     AFTER_EXPOSURE_MS = 100,
     UNMEASURED_LAG_MS = 350,  // from full-press to the open shutter, of a body whose lag is not known; one that slept takes so long
     FEEDBACK_WAIT_MS = 1000,  // calibration: flash-sync contacts close within

@@ -13,12 +13,8 @@ struct trigger {
 int trigger_open(struct trigger **out, const struct config *config, const struct trigger_host *host)
 {
     static const struct trigger_ops *const ops[] = { [TRIGGER_SOFTWARE] = &trigger_software, [TRIGGER_GPIO] = &trigger_gpio,
-        [TRIGGER_USB] = NULL, [TRIGGER_SIMULATED] = &trigger_simulated };
+        [TRIGGER_USB] = &trigger_usb, [TRIGGER_SIMULATED] = &trigger_simulated };
     *out = NULL;
-    if (!ops[config->trigger.kind]) {
-        log_error("trigger: kind = usb: this rigd has no driver for the trigger board: use kind = gpio or software");
-        return -ENODEV;
-    }
     struct trigger *t = calloc(1, sizeof(*t));
     if (!t)
         return -ENOMEM;
@@ -39,7 +35,7 @@ unsigned trigger_abilities(const struct trigger *t)
 
 int trigger_fire(struct trigger *t, const struct trigger_shot *shot)
 {
-    return t->ops->fire(t->self, shot);
+    return shot->on_button && !(t->ops->abilities(t->self) & TRIGGER_WAITS) ? -ENOTSUP : t->ops->fire(t->self, shot);
 }
 
 void trigger_release(struct trigger *t)

@@ -32,6 +32,7 @@ enum { // trigger_abilities()
     TRIGGER_BUTTON = 16,
     TRIGGER_RELAYS = 32,
     TRIGGER_HEAD = 64,        // a motorised panorama head
+    TRIGGER_WAITS = 128,      // a shot may wait for the button
 };
 
 struct trigger_shot {
@@ -39,6 +40,9 @@ struct trigger_shot {
     uint32_t half_ms, hold_ms; // half 0: none. hold: full-press, then both lines are released
     const uint32_t *delay_us; // per camera, n_cameras of them, or NULL; kept by the caller until fired(). < 1 s each
     const uint64_t *skip;     // bit per camera that must not be pressed (quarantined), or NULL; likewise kept
+    // Half-press comes with the press of the button, full-press half_ms later, with no decision of this host in between; at_ns does not
+    // count. button() is not called for this press. Waits until then, or for trigger_release(). Only with TRIGGER_WAITS.
+    bool on_button;
 };
 
 // Take the lines named in config and leave every one released. config and host are kept.
@@ -77,4 +81,4 @@ struct trigger_ops {
     void (*dispatch)(void *self);
     void (*close)(void *self);
 };
-extern const struct trigger_ops trigger_software, trigger_gpio, trigger_simulated;
+extern const struct trigger_ops trigger_software, trigger_gpio, trigger_usb, trigger_simulated;

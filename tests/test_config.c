@@ -228,6 +228,46 @@ static void naming_a_section_asks_for_what_it_does(void **state)
     config_free(&c);
 }
 
+#define BOARD(more) "[rig]\ntakes = /t\n[trigger]\nkind = usb\noutput_registers = 3\n" more A01 // A01 from line 6 on
+static void the_lines_of_a_board_are_outputs_and_inputs(void **state)
+{
+    (void)state;
+    static const struct {
+        const char *text, *where, *what;
+    } cases[] = {
+        { "[rig]\ntakes = /t\n[trigger]\nkind = usb\n" A01 "full_line = 0\n", "rigd.conf:3:", "needs 'output_registers = '" },
+        { BOARD("") "", "rigd.conf:6:", "has no full_line" },
+        { BOARD("") "full_line = 24\n", "rigd.conf:6:", "found 24, expected 0 to 23: output_registers = 3 is 24 outputs" },
+        { BOARD("") "full_line = 3\nhalf_line = 3\n", "rigd.conf:6:", "line 3 is camera A01's full_line already" },
+        { BOARD("") "full_line = 3\nrelay_line = 24\n", "rigd.conf:6:", "relay_line: found 24" },
+        { BOARD("") "full_line = 3\nfeedback_line = 200\n", "rigd.conf:6:", "feedback_line: found 200, expected 0 to 199 or capture" },
+        { BOARD("button_line = 3\n") "full_line = 3\n", "rigd.conf:3:", "remove button_line" },
+        { BOARD("active_low = yes\n") "full_line = 3\n", "rigd.conf:3:", "remove active_low" },
+        { BOARD("") "full_line = capture\n", "rigd.conf:8:", "a line's number" },
+        { BOARD("") "full_line = 0\nfeedback_line = capture\n[camera \"A02\"]\nport = usb:1-2\nfull_line = 1\nfeedback_line = capture\n", "rigd.conf:10:", "the capture input is camera A01's" },
+        { "[rig]\ntakes = /t\n[trigger]\nkind = usb\noutput_registers = 52\n" A01 "full_line = 256\nhalf_line = 415\n", "rigd.conf:6:", "full_line: found 256, expected 0 to 255" },
+        { "[rig]\ntakes = /t\n[trigger]\nkind = usb\noutput_registers = 53\n" A01 "full_line = 0\n", "rigd.conf:5:", "a whole number from 1 to 52" },
+        { HEAD A01 "feedback_line = capture\n", "rigd.conf:5:", "only kind = usb" },
+    };
+    struct config c;
+    for (size_t i = 0; i < sizeof(cases) / sizeof(cases[0]); i++)
+        if (parse(&c, cases[i].text) != -EINVAL || !strstr(said, cases[i].where) || !strstr(said, cases[i].what))
+            fail_msg("case %zu: expected '%s' '%s', said:\n%s", i, cases[i].where, cases[i].what, said);
+    assert_int_equal(parse(&c, BOARD("serial = 85323\nfeedback_active_low = no\nhead_yaw_steps_per_turn = -3200\n") "full_line = 3\nhalf_line = 11\nfeedback_line = 3\n"), 0);
+    assert_int_equal(c.trigger.kind, TRIGGER_USB);
+    assert_string_equal(c.trigger.serial, "85323");
+    assert_int_equal(c.trigger.output_registers, 3);
+    assert_int_equal(c.trigger.head_steps_per_turn[0], -3200);
+    assert_true(c.trigger.button_active_low && !c.trigger.feedback_active_low); // to ground, unless said otherwise
+    config_free(&c);
+    assert_int_equal(parse(&c, BOARD("") "full_line = 3\nfeedback_line = capture\n"), 0);
+    assert_int_equal(c.camera[0].feedback_line, CONFIG_CAPTURE);
+    config_free(&c);
+    assert_int_equal(parse(&c, HEAD A01), 0);
+    assert_false(c.trigger.button_active_low); // gpio's and others' own rule
+    config_free(&c);
+}
+
 static void a_thousand_faults_do_not_fill_the_journal(void **state)
 {
     (void)state;
@@ -295,6 +335,7 @@ int main(void)
         cmocka_unit_test(a_line_without_half_press_may_be_held_for_all_of_its_limit),
         cmocka_unit_test(what_rigsim_lists_is_accepted_as_it_stands),
         cmocka_unit_test(naming_a_section_asks_for_what_it_does),
+        cmocka_unit_test(the_lines_of_a_board_are_outputs_and_inputs),
         cmocka_unit_test(a_thousand_faults_do_not_fill_the_journal),
         cmocka_unit_test(zero_bytes_and_other_line_ends_are_no_trouble),
         cmocka_unit_test(the_page_listens_where_it_is_told_and_nowhere_unasked),

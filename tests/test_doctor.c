@@ -224,6 +224,58 @@ static void a_device_that_cannot_be_opened_names_the_rules(void **state)
     tear_down_machine();
 }
 
+static void plug_board(int port, const char *maker, const char *serial, const char *version)
+{
+    static const char *const names[] = { "idVendor", "idProduct", "manufacturer", "product", "serial", "bcdDevice", "busnum", "devnum" };
+    char number[20], path[200], text[80];
+    snprintf(number, sizeof(number), "%d", port);
+    const char *const values[] = { "1209", "5247", maker, "trigger board", serial, version, "2", number };
+    for (int i = 0; i < 8; i++) {
+        snprintf(path, sizeof(path), "/sys/bus/usb/devices/2-%d/%s", port, names[i]);
+        snprintf(text, sizeof(text), "%s\n", values[i]);
+        put(path, text);
+    }
+    snprintf(path, sizeof(path), "/dev/bus/usb/002/%03d", port);
+    put(path, "");
+}
+
+static void the_trigger_board_is_found_or_what_is_in_its_way(void **state)
+{
+    (void)state;
+    char full[700];
+    assert_int_equal(set_up_machine(1, 1), 0);
+    plug_board(3, "somebody", "S1", "0100");
+    examine();
+    assert_int_equal(n_found(NULL, "trigger board", "", ""), 0); // nobody asked for one
+    config.trigger.kind = TRIGGER_USB;
+    examine();
+    assert_false(healthy());
+    assert_int_equal(n_found("error", "trigger board", "S1 (somebody trigger board) at 2-3", ""), 1);
+    plug_board(4, "studiorig", "85323130", "0100");
+    examine();
+    assert_int_equal(n_found("info", "trigger board", "board 85323130 at USB 2-4", "protocol 1.0"), 1);
+    assert_true(healthy());
+    holds(1234, "another\n", "/dev/bus/usb/002/004");
+    examine();
+    assert_int_equal(n_found("error", "trigger board", "held by another (process 1234)", ""), 1);
+    plug_board(5, "studiorig", "85323131", "0200");
+    examine();
+    assert_int_equal(n_found("error", "trigger board", "2 are plugged in", "[trigger] serial"), 1);
+    strcpy(config.trigger.serial, "85323131");
+    examine();
+    assert_int_equal(n_found("error", "trigger board", "speaks protocol 2.0, this rigd 1.0", "flash"), 1);
+    assert_int_equal(n_found(NULL, "trigger board", "", ""), 1);
+    strcpy(config.trigger.serial, "4711");
+    examine();
+    assert_int_equal(n_found("error", "trigger board", "no board 4711", "correct [trigger] serial"), 1);
+    strcpy(config.trigger.serial, "85323130");
+    snprintf(full, sizeof(full), "%s/dev/bus/usb/002/004", root);
+    assert_int_equal(geteuid() ? chmod(full, 0400) : unlink(full), 0);
+    examine();
+    assert_int_equal(n_found("error", "trigger board", "install rigd's udev rules", ""), 1);
+    tear_down_machine();
+}
+
 static void a_disk_that_is_full_or_not_there_is_told(void **state)
 {
     (void)state;
@@ -293,6 +345,7 @@ int main(void)
         cmocka_unit_test(who_holds_a_camera_is_named),
         cmocka_unit_test(an_empty_port_and_the_wrong_body_are_told),
         cmocka_unit_test(a_device_that_cannot_be_opened_names_the_rules),
+        cmocka_unit_test(the_trigger_board_is_found_or_what_is_in_its_way),
         cmocka_unit_test(a_disk_that_is_full_or_not_there_is_told),
         cmocka_unit_test(a_page_that_others_can_reach_is_told),
         cmocka_unit_test(this_machine_can_be_looked_at),

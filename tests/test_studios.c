@@ -15,6 +15,7 @@ static const struct {
     { "config/studio-85.conf", 85, 22, TRIGGER_HALF_PRESS },
     { "config/desk-3.conf", 3, 3, TRIGGER_HALF_PRESS | TRIGGER_DELAYS | TRIGGER_RELAYS },
     { "config/simulated.conf", 6, 0, TRIGGER_HALF_PRESS | TRIGGER_DELAYS | TRIGGER_RELAYS },
+    { "config/simulated-board.conf", 6, 6, TRIGGER_HALF_PRESS | TRIGGER_DELAYS | TRIGGER_RELAYS },
 };
 
 static void every_shipped_studio_can_shoot(void **state)
