@@ -759,13 +759,12 @@ int processing_add(struct processing *p, int64_t now_ns, const struct processing
         p->take[p->n_takes++] = t;
         copy(t->id, sizeof(t->id), what->id);
         t->settled = true;
+        t->added_ns = now_ns;
         for (int s = 0; s < PROCESSING_N_STEPS; s++)
             t->step[s].began_ns = t->step[s].ended_ns = INT64_MIN;
     }
-    if (t->settled) {
-        t->added_ns = now_ns;
+    if (t->settled)
         t->is_panorama = what->is_panorama;
-    }
     for (int s = 0; s < PROCESSING_N_STEPS; s++) {
         const enum processing_state state = t->step[s].state;
         const bool again = state == PROCESSING_FAILED || state == PROCESSING_MISSING || state == PROCESSING_CANCELLED;
@@ -795,7 +794,6 @@ int processing_again(struct processing *p, int64_t now_ns, const char *take, enu
         if (s == (int)step || ((mask & BIT(s)) && t->step[s].state != PROCESSING_OFF))
             begin_anew(&t->step[s]); // what follows is looked at: made anew only if what it was made from is another
     t->forget |= BIT(step);
-    t->added_ns = t->settled ? now_ns : t->added_ns;
     t->cancelled = t->settled = false;
     t->dirty = true;
     advance(p, now_ns);
