@@ -157,6 +157,7 @@ static int bench_edges(int n_shots)
     for (size_t r = 0; r < sizeof(rigs) / sizeof(*rigs); r++) {
         long histogram[ERRORS] = { 0 };
         load_board();
+        simavr_board_fit(board, rigs[r].registers);
         connect(rigs[r].registers, rigs[r].inputs);
         simavr_board_clear_latency(board);
         const double begin = seconds();

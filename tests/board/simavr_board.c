@@ -48,6 +48,7 @@ struct simavr_board {
     uint64_t clock_start; // cycle at which timer 1 began to count
     bool clock_runs, dead;
     unsigned n_resets;
+    int n_registers;
     void (*core_reset)(struct avr_t *);
     // the chains
     uint8_t chain[SIMAVR_REGISTERS], latched[SIMAVR_REGISTERS], seen[SIMAVR_REGISTERS];
@@ -99,9 +100,10 @@ static void on_latch(avr_irq_t *irq, uint32_t value, void *param)
         const uint64_t match = b->timer1->tov_base + b->timer1->comp[AVR_TIMER_COMPA].comp_cycles;
         const bool by_timer = !(b->portb & LATCH) && match <= b->avr->cycle && b->avr->cycle - match < 64;
         bool press = false; // a release may be armed as late as it likes
-        for (size_t r = 0; r < sizeof(b->chain); r++)
+        for (int r = 0; r < b->n_registers; r++) {
             press |= (b->chain[r] & ~b->latched[r]) != 0;
-        memcpy(b->latched, b->chain, sizeof(b->chain));
+            b->latched[r] = b->chain[r];
+        }
         if (by_timer && press && match - b->armed < b->margin)
             b->margin = (uint32_t)(match - b->armed);
         show(b, by_timer ? match : b->avr->cycle);
@@ -355,11 +357,17 @@ struct simavr_board *simavr_board_open(const char *elf, const struct simavr_boar
     memset(b->input, 0xFF, sizeof(b->input));
     b->timer1 = find_timer1(b->avr);
     b->margin = UINT32_MAX;
+    b->n_registers = SIMAVR_REGISTERS;
     wire(b);
     rest_inputs(b);
     b->core_reset = b->avr->reset;
     b->avr->reset = core_reset;
     return b;
+}
+
+void simavr_board_fit(struct simavr_board *b, int n_registers)
+{
+    b->n_registers = n_registers;
 }
 
 void simavr_board_close(struct simavr_board *b)

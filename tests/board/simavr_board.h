@@ -21,6 +21,7 @@ struct simavr_board_watch { // NULL: not interested
 // NULL: the image cannot be read (said on stderr). watch is copied.
 struct simavr_board *simavr_board_open(const char *elf, const struct simavr_board_watch *watch);
 void simavr_board_close(struct simavr_board *b);
+void simavr_board_fit(struct simavr_board *b, int n_registers); // output registers there are; 52 unless said otherwise
 
 void simavr_board_run(struct simavr_board *b, uint64_t n_cycles);
 uint64_t simavr_board_cycle(const struct simavr_board *b);
