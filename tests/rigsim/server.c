@@ -7,6 +7,7 @@
 #include <arpa/inet.h>
 #include <errno.h>
 #include <netinet/tcp.h>
+#include <poll.h>
 #include <signal.h>
 #include <stdio.h>
 #include <stdlib.h>
@@ -222,11 +223,18 @@ static void fail_init(struct camera *c, struct link *l)
     send_packet(c, l, &no);
 }
 
+// A client that was killed and is back at once may come before the loop has heard that it went: by an end or, with bytes unread, a reset.
+static void close_dead(struct camera *c, struct link *l)
+{
+    struct pollfd p = { .fd = l->fd, .events = POLLRDHUP };
+    if (poll(&p, 1, 0) > 0 && (p.revents & (POLLRDHUP | POLLHUP | POLLERR)))
+        close_link(c, l);
+}
+
 static void init_command(struct camera *c, struct link *l)
 {
-    char gone;
-    if (c->command && recv(c->command->fd, &gone, 1, MSG_PEEK | MSG_DONTWAIT) == 0)
-        close_link(c, c->command); // its end was not noticed yet
+    if (c->command)
+        close_dead(c, c->command);
     if (c->command) {
         fail_init(c, l);
         return;
