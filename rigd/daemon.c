@@ -42,7 +42,7 @@
 #include <unistd.h>
 
 #define S INT64_C(1000000000)
-enum { TRIGGER_RETRY_S = 5, WORKERS_END_MS = 1500, WAITERS_MAX = 64 };
+enum { TRIGGER_RETRY_S = 5, WORKERS_END_MS = 1500, BLINK_MS = 5000, WAITERS_MAX = 64 };
 
 struct daemon;
 
@@ -1041,9 +1041,32 @@ static int camera_named(struct daemon *d, uint64_t token, const struct json *req
     return -1;
 }
 
+static bool is_board(const struct daemon *d, const char *name)
+{
+    for (int i = 0; i < d->config.n_cameras; i++)
+        if (!strcasecmp(d->config.camera[i].name, name))
+            return false;
+    return !strcasecmp(name, "board");
+}
+
+static void identify_board(struct daemon *d, uint64_t token)
+{
+    const int err = d->trigger ? trigger_identify(d->trigger, BLINK_MS) : -ENOTCONN;
+    if (err)
+        refuse(d, token, err, err == -ENOTCONN ? "there is no trigger" : err == -ENOTSUP ? "this kind of trigger has no light; a trigger board ([trigger] kind = usb) has" : "the trigger board does not answer");
+    else
+        control_reply(d->control, token, json_new_object());
+}
+
 static void ask_identify(struct daemon *d, uint64_t token, const struct json *request)
 {
+    const char *name = "";
     char why[200];
+    json_get_string(request, "camera", &name);
+    if (is_board(d, name)) {
+        identify_board(d, token);
+        return;
+    }
     const int i = camera_named(d, token, request);
     if (i < 0)
         return;

@@ -217,6 +217,14 @@ void live_board_outputs(struct live_board *l, uint8_t outputs[SIMAVR_REGISTERS])
     pthread_mutex_unlock(&l->lock);
 }
 
+bool live_board_led(struct live_board *l)
+{
+    pthread_mutex_lock(&l->lock);
+    const bool led = simavr_board_led(l->board);
+    pthread_mutex_unlock(&l->lock);
+    return led;
+}
+
 bool live_board_is_dead(struct live_board *l)
 {
     pthread_mutex_lock(&l->lock);
