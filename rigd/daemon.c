@@ -42,7 +42,7 @@
 #include <unistd.h>
 
 #define S INT64_C(1000000000)
-enum { TRIGGER_RETRY_S = 5, WORKERS_END_MS = 1500, WAITERS_MAX = 64 };
+enum { TRIGGER_RETRY_S = 5, WORKERS_END_MS = 1500, BLINK_MS = 5000, WAITERS_MAX = 64 };
 
 struct daemon;
 
@@ -63,7 +63,7 @@ struct job {
     char dir[600], id[96]; // of the take, or of all takes
     char *text;
     const struct config *config; // does not change
-    enum take_kind kind;
+    enum ledger_kind kind;
     struct ledger ledger;
     struct processing_record *record;
     struct manifest_known *known;
@@ -566,7 +566,7 @@ static void fire(struct daemon *d, const struct trigger_shot *shot)
 
 // ---- takes ---------------------------------------------------------------------------------------------------------------------------------
 
-static int begin_take(struct daemon *d, enum take_kind kind, const char *name, bool without_missing, char *why)
+static int begin_take(struct daemon *d, enum ledger_kind kind, const char *name, bool without_missing, char *why)
 {
     char plain[41], id[96], created[40], stamp[40];
     const int64_t utc = utc_ms();
@@ -581,8 +581,8 @@ static int begin_take(struct daemon *d, enum take_kind kind, const char *name, b
     strftime(stamp, sizeof(stamp), "%Y%m%dT%H%M%S", &tm);
     snprintf(id, sizeof(id), "%s%03d_%s", stamp, (int)(utc % 1000), plain);
     const struct rig_take take = { .id = id, .name = plain, .created = created, .utc_ms = utc, .takes_dir = d->takes_dir,
-                                   .panorama_take = kind == TAKE_CAPTURE ? d->panorama_take : NULL };
-    const int err = kind == TAKE_PANORAMA ? rig_panorama(d->rig, now_ns(), &take, why) : rig_capture(d->rig, now_ns(), &take, without_missing, why);
+                                   .panorama_take = kind == LEDGER_CAPTURE ? d->panorama_take : NULL };
+    const int err = kind == LEDGER_PANORAMA ? rig_panorama(d->rig, now_ns(), &take, why) : rig_capture(d->rig, now_ns(), &take, without_missing, why);
     if (!err)
         d->take_began_ns = now_ns();
     return err;
@@ -590,13 +590,13 @@ static int begin_take(struct daemon *d, enum take_kind kind, const char *name, b
 
 static int capture(struct daemon *d, const char *name, bool without_missing, char *why)
 {
-    return begin_take(d, TAKE_CAPTURE, name, without_missing, why);
+    return begin_take(d, LEDGER_CAPTURE, name, without_missing, why);
 }
 
 // Ids begin with their time.
 static void know_panorama(struct daemon *d, const struct ledger *l)
 {
-    if (l->kind == TAKE_PANORAMA && (l->state == TAKE_VERIFIED || l->state == TAKE_DEVELOPED || l->state == TAKE_SOLVED) && strcmp(l->id, d->panorama_take) > 0)
+    if (l->kind == LEDGER_PANORAMA && (l->state == TAKE_VERIFIED || l->state == TAKE_DEVELOPED || l->state == TAKE_SOLVED) && strcmp(l->id, d->panorama_take) > 0)
         snprintf(d->panorama_take, sizeof(d->panorama_take), "%s", l->id);
 }
 
@@ -961,7 +961,7 @@ static void ask_panorama(struct daemon *d, uint64_t token, const struct json *re
     const char *name = "panorama";
     char why[200];
     json_get_string(request, "name", &name);
-    const int err = d->n_unfinished ? -EBUSY : begin_take(d, TAKE_PANORAMA, name, false, why);
+    const int err = d->n_unfinished ? -EBUSY : begin_take(d, LEDGER_PANORAMA, name, false, why);
     if (d->n_unfinished)
         snprintf(why, sizeof(why), "an unfinished take is being collected; wait for it");
     if (err)
@@ -1041,9 +1041,32 @@ static int camera_named(struct daemon *d, uint64_t token, const struct json *req
     return -1;
 }
 
+static bool is_board(const struct daemon *d, const char *name)
+{
+    for (int i = 0; i < d->config.n_cameras; i++)
+        if (!strcasecmp(d->config.camera[i].name, name))
+            return false;
+    return !strcasecmp(name, "board");
+}
+
+static void identify_board(struct daemon *d, uint64_t token)
+{
+    const int err = d->trigger ? trigger_identify(d->trigger, BLINK_MS) : -ENOTCONN;
+    if (err)
+        refuse(d, token, err, err == -ENOTCONN ? "there is no trigger" : err == -ENOTSUP ? "this kind of trigger has no light; a trigger board ([trigger] kind = usb) has" : "the trigger board does not answer");
+    else
+        control_reply(d->control, token, json_new_object());
+}
+
 static void ask_identify(struct daemon *d, uint64_t token, const struct json *request)
 {
+    const char *name = "";
     char why[200];
+    json_get_string(request, "camera", &name);
+    if (is_board(d, name)) {
+        identify_board(d, token);
+        return;
+    }
     const int i = camera_named(d, token, request);
     if (i < 0)
         return;
@@ -1430,7 +1453,7 @@ static void obey(struct daemon *d, const struct rig_action *a)
     case RIG_MANIFEST:
         j = new_job(work_manifest, done_manifest);
         know_copies(j, l);
-        if (l->kind == TAKE_PANORAMA) {
+        if (l->kind == LEDGER_PANORAMA) {
             struct json *plan = describe_plan(l, &d->config);
             j->text = json_text(plan);
             json_free(plan);

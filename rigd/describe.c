@@ -215,8 +215,8 @@ struct json *describe_take(const struct ledger *l, bool with_cameras)
     json_set_string(o, "created", l->created);
     json_set_string(o, "state", take_state_name(l->state));
     put(o, "reason", l->reason);
-    json_set_string(o, "kind", l->kind == TAKE_PANORAMA ? "panorama" : "capture");
-    if (l->kind == TAKE_PANORAMA)
+    json_set_string(o, "kind", l->kind == LEDGER_PANORAMA ? "panorama" : "capture");
+    if (l->kind == LEDGER_PANORAMA)
         json_set_int(o, "n_stops", l->n_stops);
     put(o, "panorama_take", l->panorama_take);
     json_set_int(o, "n_expected", n_expected);

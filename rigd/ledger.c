@@ -27,7 +27,7 @@ enum { ENTRIES_MAX = 4 * CONFIG_CAMERAS_MAX };
 static const char *const state_names[TAKE_N_STATES] = {
     "idle", "preflight", "armed", "exposing", "collecting", "verified", "developed", "solved", "failed",
 };
-static const char *const kind_names[TAKE_N_KINDS] = { "capture", "panorama" };
+static const char *const kind_names[LEDGER_N_KINDS] = { "capture", "panorama" };
 static const char *const object_states[OBJECT_N_STATES] = { "found", "copied", "deleted", "gone" };
 static const char *const debts[] = { "open", "paid", "missed" };
 static const char *const processings[LEDGER_N_PROCESSING] = { "none", "owed", "settled", "cancelled" };
@@ -60,7 +60,7 @@ void ledger_init(struct ledger *l, const struct config *config)
 
 void ledger_init_panorama(struct ledger *l, const struct config *config)
 {
-    *l = (struct ledger){ .kind = TAKE_PANORAMA, .objects_per_shot = 1, .spread_ns = -1, .sigma_ns = -1, .jitter_ns = -1,
+    *l = (struct ledger){ .kind = LEDGER_PANORAMA, .objects_per_shot = 1, .spread_ns = -1, .sigma_ns = -1, .jitter_ns = -1,
                           .processing = config->process.develop ? LEDGER_OWED : LEDGER_UNPROCESSED };
     l->n_stops = config->panorama.n_stops;
     memcpy(l->stop, config->panorama.stop, sizeof(l->stop));
@@ -294,7 +294,7 @@ char *ledger_text(const struct ledger *l)
     json_set_string(doc, "id", l->id);
     json_set_string(doc, "kind", kind_names[l->kind]);
     put(doc, "panorama_take", l->panorama_take);
-    if (l->kind == TAKE_PANORAMA) {
+    if (l->kind == LEDGER_PANORAMA) {
         struct json *stops = json_new_array();
         for (int i = 0; i < l->n_stops; i++) {
             struct json *stop = json_new_object();
@@ -497,9 +497,9 @@ static void get_exposure(struct reader *r, struct ledger_camera *c)
 static void get_stops(struct reader *r, struct ledger *l)
 {
     if (json_get(r->v, "kind"))
-        l->kind = get_word(r, "kind", kind_names, TAKE_N_KINDS);
+        l->kind = get_word(r, "kind", kind_names, LEDGER_N_KINDS);
     get_string(r, "panorama_take", l->panorama_take, sizeof(l->panorama_take));
-    if (l->kind != TAKE_PANORAMA)
+    if (l->kind != LEDGER_PANORAMA)
         return;
     l->n_stops = get_length(r, "stops", CONFIG_STOPS_MAX);
     for (int i = 0; i < l->n_stops; i++) {
@@ -610,7 +610,7 @@ int ledger_parse(struct ledger *out, const char *text, size_t n_bytes, const cha
         struct reader c = child(&r, "cameras", i);
         get_camera(&c, &out->camera[i]);
         r.bad |= c.bad;
-        if (c.v && out->camera[i].is_exposure != (out->kind == TAKE_PANORAMA) && !r.bad)
+        if (c.v && out->camera[i].is_exposure != (out->kind == LEDGER_PANORAMA) && !r.bad)
             complain(&c, "exposure", "one in a panorama, none in a capture"), r.bad = true;
         if (out->camera[i].is_exposure && out->camera[i].exposure.stop >= out->n_stops && !r.bad)
             complain(&c, "exposure.stop", "one of stops"), r.bad = true;
@@ -674,9 +674,9 @@ static int sync_folder(const char *dir)
 
 static const struct {
     const char *name;
-    enum take_kind kind;
-} folders[] = { { "raw", TAKE_CAPTURE }, { "thumbnails", TAKE_CAPTURE }, { "linear", TAKE_CAPTURE }, { "geometry", TAKE_CAPTURE }, { "geometry/cameras", TAKE_CAPTURE },
-                { "panorama", TAKE_PANORAMA }, { "panorama/raw", TAKE_PANORAMA } };
+    enum ledger_kind kind;
+} folders[] = { { "raw", LEDGER_CAPTURE }, { "thumbnails", LEDGER_CAPTURE }, { "linear", LEDGER_CAPTURE }, { "geometry", LEDGER_CAPTURE },
+                { "geometry/cameras", LEDGER_CAPTURE }, { "panorama", LEDGER_PANORAMA }, { "panorama/raw", LEDGER_PANORAMA } };
 enum { N_FOLDERS = sizeof(folders) / sizeof(folders[0]) };
 
 static bool is_part(const char *name) // .NAME.tag.part of atomic_file, NAME.part of ingest; no camera's name holds a dot
@@ -716,7 +716,7 @@ static void remove_new(const char *dir)
     rmdir(dir);
 }
 
-int ledger_create(const char *text, enum take_kind kind, const char *id, const char *takes_dir)
+int ledger_create(const char *text, enum ledger_kind kind, const char *id, const char *takes_dir)
 {
     char dir[1024], final[1024], path[1200];
     join(final, sizeof(final), takes_dir, id);
@@ -732,7 +732,7 @@ int ledger_create(const char *text, enum take_kind kind, const char *id, const c
             err = mkdir(path, 0777) ? -errno : 0;
         }
     if (!err) {
-        join(path, sizeof(path), dir, kind == TAKE_PANORAMA ? "panorama" : "geometry");
+        join(path, sizeof(path), dir, kind == LEDGER_PANORAMA ? "panorama" : "geometry");
         err = sync_folder(path);
     }
     if (!err)
@@ -835,7 +835,7 @@ int ledger_reconcile(struct ledger *l, const char *take_dir, struct ledger_findi
         if (taken_back)
             c->debt = DEBT_OPEN;
     }
-    const char *const folder = l->kind == TAKE_PANORAMA ? "panorama/raw" : "raw";
+    const char *const folder = l->kind == LEDGER_PANORAMA ? "panorama/raw" : "raw";
     join(path, sizeof(path), take_dir, folder);
     DIR *d = err ? NULL : opendir(path);
     for (const struct dirent *e; d && (e = readdir(d));) {

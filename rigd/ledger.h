@@ -11,7 +11,7 @@
 enum { LEDGER_FORMAT = 1, LEDGER_OBJECTS_MAX = 8 }; // per camera and take
 
 // A capture: one shot of all cameras, an entry of `camera` for each. A panorama: many exposures of one camera, an entry for each exposure.
-enum take_kind { TAKE_CAPTURE, TAKE_PANORAMA, TAKE_N_KINDS };
+enum ledger_kind { LEDGER_CAPTURE, LEDGER_PANORAMA, LEDGER_N_KINDS };
 
 enum take_state { TAKE_IDLE, TAKE_PREFLIGHT, TAKE_ARMED, TAKE_EXPOSING, TAKE_COLLECTING, TAKE_VERIFIED, TAKE_DEVELOPED, TAKE_SOLVED, TAKE_FAILED, TAKE_N_STATES };
 
@@ -90,7 +90,7 @@ struct ledger {
     char id[96];                // folder name: <UTC date>T<time>_<name>
     char name[64];
     char created[32];           // UTC, ISO 8601
-    enum take_kind kind;
+    enum ledger_kind kind;
     enum take_state state;
     char reason[200];           // of failed
     char panorama_take[96];     // of a capture: the newest panorama take there was; ""
@@ -134,7 +134,7 @@ int ledger_parse(struct ledger *out, const char *text, size_t n_bytes, const cha
 
 // Create takes_dir/id with raw/, thumbnails/, linear/ and geometry/cameras/ (panorama/raw/) and its first ledger, whole and durable or not at all.
 // -EEXIST if there is one. 0 or -errno (logged).
-int ledger_create(const char *text, enum take_kind kind, const char *id, const char *takes_dir);
+int ledger_create(const char *text, enum ledger_kind kind, const char *id, const char *takes_dir);
 void ledger_remove_leftovers(const char *takes_dir); // of creations that a crash ended; for the start of the daemon
 
 // Bring ledger and disk together after a crash: remove *.part, hash frames that are here but not yet noted (they become COPIED),

@@ -2,10 +2,10 @@
 // geometry, giving a solve its name.
 #include "rigd/products.h"
 #include "rigd/digest.h"
-#include "rigd/pieces.h"
 #include "solver/take/atomic_file.h"
 #include "solver/take/json.h"
 #include "solver/take/log.h"
+#include "solver/take/take.h"
 
 #include <dirent.h>
 #include <errno.h>
@@ -347,7 +347,7 @@ int products_open(struct products **out, const struct products_site *site, const
     err = ledger_read(&p->ledger, p->dir);
     if (err)
         goto fail;
-    p->is_panorama = p->ledger.kind == TAKE_PANORAMA;
+    p->is_panorama = p->ledger.kind == LEDGER_PANORAMA;
     static const char *const parts[][2] = { { ".", ".panorama" }, { ".", ".processing.json" }, { "linear", "." }, { "sheet", "." }, { "geometry", "." }, { "geometry/cameras", "." } };
     for (size_t i = 0; i < sizeof(parts) / sizeof(parts[0]); i++)
         remove_parts(p, parts[i][0], parts[i][1]);
@@ -534,7 +534,7 @@ static bool find_panorama_take(const struct products *p, char out[96])
         const char *name = entries[i]->d_name;
         snprintf(path, sizeof(path), "%s/%s", p->site->takes_dir, name);
         if (!found && name[0] != '.' && strlen(name) < 96 && strcmp(name, p->id) < 0 && !ledger_read(&ledger, path)) {
-            found = ledger.kind == TAKE_PANORAMA && (ledger.state == TAKE_VERIFIED || ledger.state == TAKE_DEVELOPED || ledger.state == TAKE_SOLVED);
+            found = ledger.kind == LEDGER_PANORAMA && (ledger.state == TAKE_VERIFIED || ledger.state == TAKE_DEVELOPED || ledger.state == TAKE_SOLVED);
             ledger_free(&ledger);
             if (found)
                 snprintf(out, 96, "%.95s", name);
@@ -586,14 +586,15 @@ static int look_at_reconstruct(struct look *l, char text[PROCESSING_TEXT])
     const struct note *note = find_note(p, STEP_RECONSTRUCT, "");
     const bool configured = c->command[0] || c->calibrated[0];
     char path[PATH_BYTES];
-    struct pieces has;
-    const int err = pieces_find(&has, p->dir);
+    struct take *take = NULL;
+    const int err = take_open(&take, p->dir);
     if (err)
         return err;
-    const bool complete = has.mesh[0] && has.cameras[0];
+    const bool has_mesh = take->mesh_path, has_cameras = take->cameras_path, complete = has_mesh && has_cameras;
+    take_close(take);
     if (!complete && !configured)
         say(text, "geometry/ has no %s; name a [reconstruct] command or calibrated folder in rigd.conf, or put %s there; then rigctl process %.95s",
-            has.mesh[0] ? "cameras" : has.cameras[0] ? "mesh" : "mesh and no cameras", has.mesh[0] || has.cameras[0] ? "it" : "them", p->id);
+            has_mesh ? "cameras" : has_cameras ? "mesh" : "mesh and no cameras", has_mesh || has_cameras ? "it" : "them", p->id);
     if (text[0])
         return 0;
     struct job *j = add_item(l, "", PRODUCT_OWED);
@@ -620,24 +621,26 @@ static int look_at_solve(struct look *l, char text[PROCESSING_TEXT])
 {
     struct products *p = l->p;
     char linear[PATH_BYTES];
-    struct pieces has;
-    const int err = pieces_find(&has, p->dir);
+    struct take *take = NULL;
+    const int err = take_open(&take, p->dir);
     if (err)
         return err;
-    if (!has.mesh[0] || !has.cameras[0] || !has.panorama[0] || !has.n_views) {
-        say(text, "not started: missing are%s%s%s%s", has.mesh[0] ? "" : " geometry/mesh.*", has.cameras[0] ? "" : " geometry/cameras", has.panorama[0] ? "" : " panorama.exr",
-            has.n_views ? "" : " linear/*.exr");
+    if (!take->mesh_path || !take->cameras_path || !take->panorama_path || !take->n_views) {
+        say(text, "not started: missing are%s%s%s%s", take->mesh_path ? "" : " geometry/mesh.*", take->cameras_path ? "" : " geometry/cameras",
+            take->panorama_path ? "" : " panorama.exr", take->n_views ? "" : " linear/*.exr");
+        take_close(take);
         return 0;
     }
     struct job *j = add_item(l, "", PRODUCT_OWED);
     snprintf(j->out, sizeof(j->out), "solve/%s/report.json", solve_name(l->step));
     struct key key = key_begin(solve_name(l->step));
     key_text(&key, p->site->config->process.options);
-    key_file(&key, "mesh", has.mesh);
-    key_file(&key, "cameras", has.cameras);
-    key_folder(&key, has.cameras);
-    key_file(&key, "panorama", has.panorama);
-    key_file(&key, "start", has.start);
+    key_file(&key, "mesh", take->mesh_path);
+    key_file(&key, "cameras", take->cameras_path);
+    key_folder(&key, take->cameras_path);
+    key_file(&key, "panorama", take->panorama_path);
+    key_file(&key, "start", take->start_path);
+    take_close(take);
     in_take(p, linear, "linear");
     key_folder(&key, linear);
     key_end(&key, j->key);
@@ -766,10 +769,14 @@ static int copy_calibrated(const struct products *p, char text[PROCESSING_TEXT])
 // What is missing in geometry/, as words; "": nothing.
 static int look_for_geometry(const struct products *p, const char **missing)
 {
-    struct pieces has;
-    const int err = pieces_find(&has, p->dir);
-    *missing = err ? "" : has.mesh[0] ? (has.cameras[0] ? "" : "cameras") : has.cameras[0] ? "mesh.*" : "mesh.* and cameras";
-    return err;
+    struct take *take = NULL;
+    const int err = take_open(&take, p->dir);
+    *missing = "";
+    if (err)
+        return err;
+    *missing = take->mesh_path ? (take->cameras_path ? "" : "cameras") : take->cameras_path ? "mesh.*" : "mesh.* and cameras";
+    take_close(take);
+    return 0;
 }
 
 // ---- making -------------------------------------------------------------------------------------------------------------------
@@ -1030,10 +1037,11 @@ int products_keep(struct products *p, enum processing_step step, int item, const
             err = -ENOENT;
         }
         if (!err) { // something of known size: the mesh
-            struct pieces has;
-            err = pieces_find(&has, p->dir);
-            if (!err)
-                snprintf(made.file, sizeof(made.file), "geometry/%.50s", strrchr(has.mesh, '/') + 1);
+            struct take *take = NULL;
+            err = take_open(&take, p->dir);
+            if (!err && take->mesh_path)
+                snprintf(made.file, sizeof(made.file), "geometry/%.50s", strrchr(take->mesh_path, '/') + 1);
+            take_close(take);
         }
     } else if (step == STEP_PANORAMA) {
         take_findings(p, &made, text);

@@ -442,7 +442,7 @@ int rig_resume(struct rig *r, int64_t now, struct ledger *old, const char *takes
     if (err)
         return err;
     r->panorama.attended = attended;
-    if (old->kind == TAKE_PANORAMA)
+    if (old->kind == LEDGER_PANORAMA)
         return rig_resume_panorama(r, now, old, takes_dir, why);
     rig_new_ledger(r);
     if (!adopt(r, old)) {

@@ -764,7 +764,7 @@ static const struct {
     { "resume", "TAKE", resume, "fetch what a take still misses" },
     { "export", "TAKE", export, "write and check a take's ASC MHL manifest for hand-over" },
     { "calibrate", "lag", calibrate, "measure each body's shutter lag; --shots" },
-    { "identify", "CAMERA", identify, "let a camera show itself" },
+    { "identify", "CAMERA", identify, "let a camera show itself; board: the trigger board blinks" },
     { "reinstate", "CAMERA", reinstate, "try a quarantined camera again, now" },
     { "metrics", NULL, metrics, "figures as Prometheus text" },
     { "events", NULL, events, "what happens, as JSON lines" },

@@ -53,6 +53,11 @@ int trigger_head(struct trigger *t, int32_t yaw_mdeg, int32_t pitch_mdeg)
     return t->ops->head ? t->ops->head(t->self, yaw_mdeg, pitch_mdeg) : -ENOTSUP;
 }
 
+int trigger_identify(struct trigger *t, int ms)
+{
+    return t->ops->identify ? t->ops->identify(t->self, ms) : -ENOTSUP;
+}
+
 int trigger_fd(const struct trigger *t)
 {
     return t->ops->fd(t->self);

@@ -63,6 +63,9 @@ int trigger_relay(struct trigger *t, int camera, bool cut);
 // pitch up. 0 (head_arrived() will come), -EBUSY (it moves, or a shot is pending), -EINVAL (beyond its limits), -ENOTSUP, -EIO.
 int trigger_head(struct trigger *t, int32_t yaw_mdeg, int32_t pitch_mdeg);
 
+// Blink: which of the boards in the studio this one is. It stops by itself after ms (up to 65535). 0, -ENOTSUP (it has no light), -EIO.
+int trigger_identify(struct trigger *t, int ms);
+
 // For the loop: when fd is readable, call dispatch.
 int trigger_fd(const struct trigger *t);
 void trigger_dispatch(struct trigger *t);
@@ -78,6 +81,7 @@ struct trigger_ops {
     void (*release)(void *self);
     int (*relay)(void *self, int camera, bool cut); // NULL: none
     int (*head)(void *self, int32_t yaw_mdeg, int32_t pitch_mdeg); // NULL: none
+    int (*identify)(void *self, int ms); // NULL: no light
     int (*fd)(const void *self);
     void (*dispatch)(void *self);
     void (*close)(void *self);

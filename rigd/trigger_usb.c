@@ -487,6 +487,13 @@ static int usb_relay(void *self, int camera, bool cut)
     return err ? -EIO : 0;
 }
 
+static int usb_identify(void *self, int ms)
+{
+    uint8_t payload[2];
+    proto_put_u16(payload, (uint16_t)ms);
+    return tell(self, PROTO_IDENTIFY, payload, sizeof(payload), "identify") ? -EIO : 0;
+}
+
 // ---- the head ------------------------------------------------------------------------------------------------------------------------
 
 static bool has_head(const struct board *b)
@@ -971,5 +978,5 @@ static int usb_open(void **self, const struct config *config, const struct trigg
     return 0;
 }
 
-const struct trigger_ops trigger_usb = { .open = usb_open, .abilities = usb_abilities, .fire = usb_fire, .release = usb_release, .relay = usb_relay, .head = usb_head, .fd = usb_fd,
-    .dispatch = usb_dispatch, .close = usb_close };
+const struct trigger_ops trigger_usb = { .open = usb_open, .abilities = usb_abilities, .fire = usb_fire, .release = usb_release, .relay = usb_relay, .head = usb_head,
+    .identify = usb_identify, .fd = usb_fd, .dispatch = usb_dispatch, .close = usb_close };

@@ -192,7 +192,7 @@ static inline const struct ledger_object *durable_object(int camera, const struc
 {
     if (!w.has_durable)
         return NULL;
-    if (w.durable.kind != TAKE_PANORAMA)
+    if (w.durable.kind != LEDGER_PANORAMA)
         return ledger_find(&w.durable.camera[camera], o);
     const struct ledger_object *found = NULL;
     for (int e = 0; e < w.durable.n_cameras && !found; e++)
@@ -496,13 +496,13 @@ static inline void obey(const struct rig_action *a)
         break;
     case RIG_CREATE:
     case RIG_COMMIT:
-        if (a->kind == RIG_CREATE && rig_ledger(w.rig)->kind == TAKE_CAPTURE)
+        if (a->kind == RIG_CREATE && rig_ledger(w.rig)->kind == LEDGER_CAPTURE)
             w.silent_until_ns = INT64_MAX; // all have answered; what is sent now may still be on its way at half-press
         copy_ledger(&w.pending, rig_ledger(w.rig));
         later((int64_t)(uniform(2, 40) * MS), W_COMMITTED, -1, a->kind == RIG_CREATE);
         break;
     case RIG_FIRE:
-        if (w.has_durable && w.durable.kind == TAKE_PANORAMA && !w.calibrating) {
+        if (w.has_durable && w.durable.kind == LEDGER_PANORAMA && !w.calibrating) {
             const struct ledger *l = rig_ledger(w.rig);
             int n_open = 0;
             for (int e = 0; e < l->n_cameras; e++) // the exposure that is made now is noted, and what was on the card before it

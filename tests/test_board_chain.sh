@@ -86,6 +86,7 @@ check "the take says how far apart the shutters opened" sh -c "$BIN/rigctl repor
 before=$(spread_us)
 check "lag is measured through the board's inputs" "$BIN/rigctl" calibrate lag --shots 4
 check "ready again" ready
+check "asked which board it is, it takes the order" "$BIN/rigctl" identify board
 check "a second press becomes a take with the lags made up for" press 2
 after=$(spread_us)
 echo "# spread ${before:-?} us before calibration, ${after:-?} us after"

@@ -241,6 +241,30 @@ static void the_head_turns_and_knows_its_limits(void **state)
     assert_int_equal(heard.head_err, 0);
 }
 
+static int led_changes(int ms)
+{
+    int n = 0;
+    bool was = live_board_led(live);
+    for (const int64_t end_ns = clock_ns() + ms * MS; clock_ns() < end_ns; usleep(5000)) {
+        const bool is = live_board_led(live);
+        n += is != was;
+        was = is;
+    }
+    return n;
+}
+
+static void asked_which_it_is_it_blinks_for_so_long(void **state)
+{
+    (void)state;
+    plug_in_the_real_one(0);
+    open_with(3);
+    assert_int_equal(led_changes(600), 0); // steady: a session is open
+    assert_int_equal(trigger_identify(trigger, 1000), 0);
+    assert_true(led_changes(1500) >= 4);
+    assert_int_equal(led_changes(600), 0);
+    assert_true(live_board_led(live));
+}
+
 int main(int argc, char **argv)
 {
     const struct CMUnitTest tests[] = {
@@ -251,6 +275,7 @@ int main(int argc, char **argv)
         cmocka_unit_test_teardown(the_button_and_the_contacts_are_heard_when_they_closed, close_all),
         cmocka_unit_test_teardown(an_armed_shot_follows_the_button_without_the_host, close_all),
         cmocka_unit_test_teardown(a_supply_comes_back_by_itself, close_all),
+        cmocka_unit_test_teardown(asked_which_it_is_it_blinks_for_so_long, close_all),
         cmocka_unit_test_teardown(the_head_turns_and_knows_its_limits, close_all),
     };
     usbfs_preload(argv);

@@ -117,7 +117,7 @@ static void takes_are_listed_oldest_first_and_what_is_none_is_not(void **state)
         struct ledger l;
         make_ledger(&l, ids[i]);
         char *ledger = ledger_text(&l);
-        assert_int_equal(ledger_create(ledger, TAKE_CAPTURE, ids[i], dir), 0);
+        assert_int_equal(ledger_create(ledger, LEDGER_CAPTURE, ids[i], dir), 0);
         free(ledger);
         ledger_free(&l);
     }

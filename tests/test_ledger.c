@@ -233,7 +233,7 @@ static int whole_story(void)
         on_card(&l.camera[i].before[0], i, 1);
     }
     char *text = ledger_text(&l);
-    int err = ledger_create(text, TAKE_CAPTURE, ID, takes);
+    int err = ledger_create(text, LEDGER_CAPTURE, ID, takes);
     free(text);
     if (!err)
         err = finish_take(&l);
@@ -487,7 +487,7 @@ static void a_panorama_s_ledger_reads_back_as_it_was_written(void **state)
     l.camera[1].exposure.rejected = true;
     char *text = ledger_text(&l);
     assert_int_equal(ledger_parse(&back, text, strlen(text), "t"), 0);
-    assert_int_equal(back.kind, TAKE_PANORAMA);
+    assert_int_equal(back.kind, LEDGER_PANORAMA);
     assert_int_equal(back.n_stops, 2);
     assert_memory_equal(l.stop, back.stop, sizeof(l.stop));
     assert_memory_equal(l.camera, back.camera, 3 * sizeof(*l.camera));
@@ -584,7 +584,7 @@ static void frames_of_later_takes_are_not_ours(void **state)
         on_card(&l.camera[i].before[0], i, 4);
     strcpy(l.id, "20261122T100000000_later");
     char *later = ledger_text(&l);
-    assert_int_equal(ledger_create(later, TAKE_CAPTURE, l.id, takes), 0);
+    assert_int_equal(ledger_create(later, LEDGER_CAPTURE, l.id, takes), 0);
     free(later);
     ledger_free(&l);
     assert_int_equal(ledger_read(&l, take_dir), 0);

@@ -87,6 +87,7 @@ check "it says how far apart the shutters opened" sh -c "$BIN/rigctl report \$(l
 check "a second rigd on the same socket is refused" sh -c "! $BIN/rigd --config $D/rigd.conf --socket $D/s"
 check "lag is measured" "$BIN/rigctl" calibrate lag --shots 3
 check "a camera that nobody knows is refused" sh -c "! $BIN/rigctl identify Z99"
+check "a trigger without a light says so" sh -c "$BIN/rigctl identify board 2>&1 | grep 'has no light'"
 check "doctor looks at this machine" sh -c "$BIN/rigctl doctor; [ \$? -le 1 ]"
 check "metrics are Prometheus text" sh -c "$BIN/rigctl metrics | grep -q '^rigd_takes_verified_total 1'"
 k=0

@@ -137,7 +137,7 @@ static void every_stop_gets_the_exposures_it_needs(void **state)
         if (l->state != TAKE_VERIFIED)
             fail_msg("%s", l->reason);
         check_brackets(l);
-        assert_int_equal(l->kind, TAKE_PANORAMA);
+        assert_int_equal(l->kind, LEDGER_PANORAMA);
         assert_int_equal(w.n_head_moves, k ? 0 : N_STOPS);
         assert_int_equal(w.n_prompts, k ? N_STOPS : 0);
         assert_int_equal(w.n_steps[RIG_STEP_STOP_DONE], N_STOPS);

@@ -54,7 +54,7 @@ static void whatever_a_board_says_is_refused_by_name_and_hangs_nothing(void **st
         fake = (struct fake_board){ .wrong = wrongs[i].wrong, .seed = 1 };
         rig_of(3);
         assert_int_equal(usbfs_new(&usb, bed, &fake_board_ops, &fake), 0);
-        assert_int_equal(usbfs_plug(usb, PORT, 7, fake_board_descriptors, sizeof(fake_board_descriptors), "FAKE0001"), 0);
+        assert_int_equal(usbfs_plug(usb, SLOT, 7, fake_board_descriptors, sizeof(fake_board_descriptors), "FAKE0001"), 0);
         log_set_level(LOG_SILENT);
         log_set_hook(remember, NULL);
         int err = trigger_open(&trigger, &config, &host);
@@ -94,7 +94,7 @@ static void a_right_board_opens_fires_and_is_released_when_closed(void **state)
     fake = (struct fake_board){ .wrong = FAKE_RIGHT };
     rig_of(3);
     assert_int_equal(usbfs_new(&usb, bed, &fake_board_ops, &fake), 0);
-    assert_int_equal(usbfs_plug(usb, PORT, 7, fake_board_descriptors, sizeof(fake_board_descriptors), "FAKE0001"), 0);
+    assert_int_equal(usbfs_plug(usb, SLOT, 7, fake_board_descriptors, sizeof(fake_board_descriptors), "FAKE0001"), 0);
     assert_int_equal(trigger_open(&trigger, &config, &host), 0);
     assert_int_equal(trigger_abilities(trigger), TRIGGER_SYNCHRONISED | TRIGGER_HALF_PRESS | TRIGGER_DELAYS | TRIGGER_FEEDBACK | TRIGGER_BUTTON | TRIGGER_RELAYS | TRIGGER_WAITS);
     const struct trigger_shot shot = { .at_ns = clock_ns() + 100 * MS, .half_ms = 10, .hold_ms = 50 };
@@ -117,7 +117,7 @@ static void a_board_is_chosen_by_its_serial_number(void **state)
     assert_int_equal(trigger_open(&trigger, &config, &host), -ENODEV);
     assert_non_null(strstr(words, "no trigger board is plugged in"));
     assert_int_equal(usbfs_new(&usb, bed, &fake_board_ops, &fake), 0);
-    assert_int_equal(usbfs_plug(usb, PORT, 7, fake_board_descriptors, sizeof(fake_board_descriptors), "FAKE0001"), 0);
+    assert_int_equal(usbfs_plug(usb, SLOT, 7, fake_board_descriptors, sizeof(fake_board_descriptors), "FAKE0001"), 0);
     strcpy(config.trigger.serial, "4711");
     words[0] = 0;
     assert_int_equal(trigger_open(&trigger, &config, &host), -ENODEV);

@@ -509,31 +509,6 @@ static void doctor_warns_of_thirty_cameras_on_one_controller(void **state)
     unlink(scratch_path("rigd.conf"));
 }
 
-// ---- under the preload -----------------------------------------------------------------------------------------------------
-
-// umockdev redirects a program from within: this one begins anew with its library loaded first (second, after the sanitizer's).
-static void begin_anew(char **argv)
-{
-    char list[700] = "";
-    if (getenv("USB_CAMERA_BEGUN"))
-        return;
-#ifdef __SANITIZE_ADDRESS__
-    char line[500];
-    FILE *maps = fopen("/proc/self/maps", "r");
-    while (maps && !list[0] && fgets(line, sizeof(line), maps)) {
-        const char *file = strchr(line, '/');
-        if (file && strstr(file, "/libasan.so"))
-            snprintf(list, sizeof(list), "%.*s:", (int)strcspn(file, "\n"), file);
-    }
-    if (maps)
-        fclose(maps);
-#endif
-    strcat(list, "libumockdev-preload.so.0");
-    setenv("LD_PRELOAD", list, 1);
-    setenv("USB_CAMERA_BEGUN", "1", 1);
-    execv("/proc/self/exe", argv);
-}
-
 // It finds a host that dies within a request worth a word.
 static void ignore(const gchar *domain, GLogLevelFlags level, const gchar *text, gpointer arg)
 {
@@ -554,7 +529,7 @@ int main(int argc, char **argv)
         cmocka_unit_test_teardown(a_take_of_the_daemon_survives_a_pulled_cable, unplug),
         cmocka_unit_test_teardown(doctor_warns_of_thirty_cameras_on_one_controller, unplug),
     };
-    begin_anew(argv);
+    usbfs_preload(argv);
     nikon = malloc(sizeof(*nikon));
     generic = malloc(sizeof(*generic));
     bed = umockdev_testbed_new();

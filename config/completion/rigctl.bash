@@ -21,7 +21,8 @@ _rigctl() {
     '') mapfile -t COMPREPLY < <(compgen -W "status doctor preflight capture continue cancel takes report process preview resume export calibrate identify reinstate metrics events \
         panorama develop --socket --json --help --version" -- "$cur") ;;
     calibrate) mapfile -t COMPREPLY < <(compgen -W "lag colour --shots --patch --chart --places --reference --check --flat -o" -- "$cur") ;;
-    identify | reinstate) mapfile -t COMPREPLY < <(compgen -W "$(_rigctl_ask status name)" -- "$cur") ;;
+    identify) mapfile -t COMPREPLY < <(compgen -W "$(_rigctl_ask status name) board" -- "$cur") ;;
+    reinstate) mapfile -t COMPREPLY < <(compgen -W "$(_rigctl_ask status name)" -- "$cur") ;;
     process)
         if [[ $before == --again ]]; then
             mapfile -t COMPREPLY < <(compgen -W "sheet develop panorama reconstruct preview focus standard final" -- "$cur")

@@ -41,7 +41,8 @@ int main(void)
 
 #define MS INT64_C(1000000)
 #define WIRE_NS (100 * MS)
-enum { PORT = 3, PRESS_MS = 150, AWAY_MS = 1000 };
+#define SLOT "2-3"
+enum { PRESS_MS = 150, AWAY_MS = 1000 };
 
 struct simulation {
     struct config config;
@@ -129,7 +130,7 @@ static bool hear_cameras(struct simulation *s)
 
 static int plug_in(struct simulation *s)
 {
-    return usbfs_plug(s->usb, PORT, ++s->device_number, s->descriptors, s->n_descriptors, s->serial);
+    return usbfs_plug(s->usb, SLOT, ++s->device_number, s->descriptors, s->n_descriptors, s->serial);
 }
 
 static int serve(struct simulation *s, pid_t child, int signals)

@@ -198,5 +198,5 @@ static void fake_reset(void *device)
     f->n = 0;
 }
 
-const struct usbfs_ops fake_board_ops = { fake_control, fake_out, fake_in, fake_reset, fake_reset };
+const struct usbfs_ops fake_board_ops = { .control = fake_control, .out = fake_out, .in = fake_in, .reset = fake_reset, .unplugged = fake_reset, .speed_mbit = 12 };
 #endif

@@ -171,7 +171,7 @@ static void live_unplugged(void *device) // powered by the studio's supply, not 
     pthread_mutex_unlock(&l->lock);
 }
 
-const struct usbfs_ops live_board_ops = { live_control, live_out, live_in, live_reset, live_unplugged };
+const struct usbfs_ops live_board_ops = { .control = live_control, .out = live_out, .in = live_in, .reset = live_reset, .unplugged = live_unplugged, .speed_mbit = 12 };
 
 size_t live_board_descriptors(struct live_board *l, uint8_t *to, size_t room, char serial[40])
 {
@@ -215,6 +215,14 @@ void live_board_outputs(struct live_board *l, uint8_t outputs[SIMAVR_REGISTERS])
     pthread_mutex_lock(&l->lock);
     memcpy(outputs, simavr_board_outputs(l->board), SIMAVR_REGISTERS);
     pthread_mutex_unlock(&l->lock);
+}
+
+bool live_board_led(struct live_board *l)
+{
+    pthread_mutex_lock(&l->lock);
+    const bool led = simavr_board_led(l->board);
+    pthread_mutex_unlock(&l->lock);
+    return led;
 }
 
 bool live_board_is_dead(struct live_board *l)

@@ -29,4 +29,5 @@ void live_board_set(struct live_board *l, enum live_what what, int input, bool c
 // What was latched since the last call: at most max, the oldest first.
 int live_board_edges(struct live_board *l, struct live_edge *edge, int max);
 void live_board_outputs(struct live_board *l, uint8_t outputs[SIMAVR_REGISTERS]);
+bool live_board_led(struct live_board *l);
 bool live_board_is_dead(struct live_board *l);

@@ -15,7 +15,8 @@
 #include <time.h>
 
 #define MS INT64_C(1000000)
-enum { N_CAMERAS_MAX = 200, PORT = 3 };
+enum { N_CAMERAS_MAX = 200 };
+#define SLOT "2-3"
 
 static UMockdevTestbed *bed;
 static struct usbfs *usb;
@@ -140,7 +141,7 @@ static inline int close_all(void **state)
 
 static inline void plug(void)
 {
-    assert_int_equal(usbfs_plug(usb, PORT, 9, descriptors, n_descriptors, serial), 0);
+    assert_int_equal(usbfs_plug(usb, SLOT, 9, descriptors, n_descriptors, serial), 0);
 }
 
 static inline void plug_in_the_real_one(double fast_ppm)

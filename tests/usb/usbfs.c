@@ -33,6 +33,7 @@ struct usbfs {
     int n_clients;
     struct urb urb[URBS_MAX]; // in the order of submission
     int n_urbs;
+    uint64_t urb_bytes_max;
     UMockdevIoctlClient *claimed_by;
     char *path, *node; // while it is plugged in
     bool gone;
@@ -50,6 +51,13 @@ static void finish(struct urb *u, int result)
     u->done = true;
 }
 
+static void finish_all(struct usbfs *u, int result)
+{
+    for (int i = 0; i < u->n_urbs; i++)
+        if (!u->urb[i].done)
+            finish(&u->urb[i], result);
+}
+
 static void drop_urb(struct usbfs *u, int i)
 {
     g_object_unref(u->urb[i].data);
@@ -63,9 +71,8 @@ static bool is_in(const struct urb *u)
 }
 
 // Only while that host waits in a request may its memory be looked at.
-static UMockdevIoctlData *buffer_of(const struct urb *u)
+static UMockdevIoctlData *buffer_of(const struct urb *u, size_t n)
 {
-    const size_t n = (size_t)raw(u)->buffer_length;
     return n ? umockdev_ioctl_data_resolve(u->data, offsetof(struct usbdevfs_urb, buffer), n, NULL) : NULL;
 }
 
@@ -82,7 +89,7 @@ static int move(struct usbfs *u, struct urb *urb)
     else
         n = u->ops->out(u->device, r->endpoint, urb->bytes, length);
     if (n > 0 && is_in(urb)) {
-        UMockdevIoctlData *b = buffer_of(urb);
+        UMockdevIoctlData *b = buffer_of(urb, at + (size_t)n);
         if (!b)
             return -EFAULT;
         memcpy(b->data + at, urb->bytes + at, (size_t)n);
@@ -116,9 +123,11 @@ static int submit(struct usbfs *u, UMockdevIoctlClient *client, UMockdevIoctlDat
         return -EINVAL;
     if (r->type != USBDEVFS_URB_TYPE_CONTROL && r->type != USBDEVFS_URB_TYPE_BULK && r->type != USBDEVFS_URB_TYPE_INTERRUPT)
         return -EINVAL;
-    UMockdevIoctlData *b = buffer_of(&urb);
+    const bool brings = r->buffer_length && (r->type == USBDEVFS_URB_TYPE_CONTROL || !(r->endpoint & IN));
+    UMockdevIoctlData *b = brings ? buffer_of(&urb, (size_t)r->buffer_length) : NULL;
     urb.bytes = malloc((size_t)r->buffer_length + 1);
-    if (!urb.bytes || (r->buffer_length && !b)) {
+    if (!urb.bytes || (brings && !b)) {
+        g_clear_object(&b);
         free(urb.bytes);
         return -ENOMEM;
     }
@@ -128,6 +137,11 @@ static int submit(struct usbfs *u, UMockdevIoctlClient *client, UMockdevIoctlDat
     }
     g_object_ref(data);
     u->urb[u->n_urbs++] = urb;
+    uint64_t in_flight = 0;
+    for (int i = 0; i < u->n_urbs; i++)
+        in_flight += (uint64_t)raw(&u->urb[i])->buffer_length;
+    if (in_flight > u->urb_bytes_max)
+        u->urb_bytes_max = in_flight;
     return 0;
 }
 
@@ -171,6 +185,7 @@ static int handle(struct usbfs *u, UMockdevIoctlClient *client, UMockdevIoctlDat
     if (request == USBDEVFS_GETDRIVER)
         return -ENODATA; // no driver of the kernel's has it
     if (request == USBDEVFS_RESET) {
+        finish_all(u, -EPROTO);
         u->ops->reset(u->device);
         return 0;
     }
@@ -193,6 +208,9 @@ static int handle(struct usbfs *u, UMockdevIoctlClient *client, UMockdevIoctlDat
         break;
     case USBDEVFS_CLEAR_HALT:
     case USBDEVFS_RESETEP:
+        if (u->ops->clear_halt)
+            u->ops->clear_halt(u->device, (uint8_t)*(unsigned *)data->data);
+        break;
     case USBDEVFS_SETCONFIGURATION:
     case USBDEVFS_SETINTERFACE:
         break;
@@ -300,11 +318,19 @@ int usbfs_clients(struct usbfs *u)
     return n;
 }
 
-void usbfs_free(struct usbfs *u)
+uint64_t usbfs_urb_bytes_max(struct usbfs *u)
+{
+    pthread_mutex_lock(&u->lock);
+    const uint64_t n = u->urb_bytes_max;
+    pthread_mutex_unlock(&u->lock);
+    return n;
+}
+
+int usbfs_free(struct usbfs *u)
 {
     struct timespec until;
     if (!u)
-        return;
+        return 0;
     if (u->path)
         usbfs_unplug(u);
     clock_gettime(CLOCK_REALTIME, &until);
@@ -316,12 +342,13 @@ void usbfs_free(struct usbfs *u)
     pthread_mutex_unlock(&u->lock);
     if (is_held) {
         log_error("usbfs: a program still has it open: it is left as it is");
-        return;
+        return -EBUSY;
     }
     g_object_unref(u->handler);
     while (u->n_urbs)
         drop_urb(u, u->n_urbs - 1);
     free(u);
+    return 0;
 }
 
 static int add(UMockdevTestbed *bed, const char *text)
@@ -334,21 +361,39 @@ static int add(UMockdevTestbed *bed, const char *text)
     return -EINVAL;
 }
 
-int usbfs_plug(struct usbfs *u, int port, int number, const uint8_t *descriptors, size_t n, const char *serial)
+static int add_hub(UMockdevTestbed *bed, const char *path, int bus, int number)
 {
-    static const char root[] = "/devices/pci0000:00/0000:00:1a.0/usb2";
-    char text[2400], hex[1024], *sys = umockdev_testbed_get_sys_dir(u->bed), *hub = g_strdup_printf("%s%s", sys, root);
-    const bool has_hub = g_file_test(hub, G_FILE_TEST_IS_DIR);
+    char text[1200], *sys = umockdev_testbed_get_sys_dir(bed), *there = g_strdup_printf("%s%s", sys, path);
+    const bool is_there = g_file_test(there, G_FILE_TEST_IS_DIR);
+    const int minor = 128 * (bus - 1) + number - 1;
     g_free(sys);
-    g_free(hub);
+    g_free(there);
+    if (is_there)
+        return 0;
+    snprintf(text, sizeof(text),
+             "P: %s\nN: bus/usb/%03d/%03d\nE: SUBSYSTEM=usb\nE: DEVTYPE=usb_device\nE: DEVNAME=/dev/bus/usb/%03d/%03d\nE: BUSNUM=%03d\nE: DEVNUM=%03d\nE: MAJOR=189\nE: MINOR=%d\n"
+             "A: busnum=%d\\n\nA: devnum=%d\\n\nA: idVendor=1d6b\\n\nA: idProduct=0002\\n\nA: speed=480\\n\nA: bConfigurationValue=1\\n\nA: bDeviceClass=09\\n\nA: dev=189:%d\\n\nA: maxchild=16\\n\n"
+             "H: descriptors=12010002090001406B1D020000010000000109021900010100E0000904000001090000000705810304000C\n",
+             path, bus, number, bus, number, bus, number, minor, bus, number, minor);
+    return add(bed, text);
+}
+
+int usbfs_plug(struct usbfs *u, const char *slot, int number, const uint8_t *descriptors, size_t n, const char *serial)
+{
+    const int bus = atoi(slot), minor = 128 * (bus - 1) + number - 1;
+    const char *const ports = strchr(slot, '-') + 1;
+    char text[2400], hex[1024], path[400];
     if (n < 18 || 2 * n >= sizeof(hex))
         return -EINVAL;
-    snprintf(text, sizeof(text),
-             "P: %s\nN: bus/usb/002/001\nE: SUBSYSTEM=usb\nE: DEVTYPE=usb_device\nE: DEVNAME=/dev/bus/usb/002/001\nE: BUSNUM=002\nE: DEVNUM=001\nE: MAJOR=189\nE: MINOR=128\n"
-             "A: busnum=2\\n\nA: devnum=1\\n\nA: idVendor=1d6b\\n\nA: idProduct=0002\\n\nA: speed=480\\n\nA: bConfigurationValue=1\\n\nA: bDeviceClass=09\\n\nA: dev=189:128\\n\nA: maxchild=16\\n\n"
-             "H: descriptors=12010002090001406B1D020000010000000109021900010100E0000904000001090000000705810304000C\n", root);
-    if (!has_hub && add(u->bed, text))
-        return -EINVAL;
+    int at = snprintf(path, sizeof(path), "/devices/pci0000:00/0000:00:%02d.0/usb%d", 13 + bus, bus), n_hubs = 1;
+    int err = add_hub(u->bed, path, bus, n_hubs);
+    for (const char *dot = ports; !err && (dot = strchr(dot, '.')); dot++) {
+        at += snprintf(path + at, sizeof(path) - (size_t)at, "/%.*s", (int)(dot - slot), slot);
+        err = add_hub(u->bed, path, bus, ++n_hubs);
+    }
+    if (err)
+        return err;
+    snprintf(path + at, sizeof(path) - (size_t)at, "/%s", slot);
     for (size_t i = 0; i < n; i++)
         snprintf(hex + 2 * i, 3, "%02X", descriptors[i]);
     pthread_mutex_lock(&u->lock);
@@ -356,17 +401,17 @@ int usbfs_plug(struct usbfs *u, int port, int number, const uint8_t *descriptors
     u->claimed_by = NULL;
     u->ops->reset(u->device);
     pthread_mutex_unlock(&u->lock);
-    u->path = g_strdup_printf("/sys%s/2-%d", root, port);
-    u->node = g_strdup_printf("/dev/bus/usb/002/%03d", number);
+    u->path = g_strdup_printf("/sys%s", path);
+    u->node = g_strdup_printf("/dev/bus/usb/%03d/%03d", bus, number);
     if (!umockdev_testbed_attach_ioctl(u->bed, u->node, u->handler, NULL))
         return -EINVAL;
     const unsigned vendor = descriptors[8] | descriptors[9] << 8, product = descriptors[10] | descriptors[11] << 8;
     snprintf(text, sizeof(text),
-             "P: %s/2-%d\nN: bus/usb/002/%03d\nE: SUBSYSTEM=usb\nE: DEVTYPE=usb_device\nE: DEVNAME=/dev/bus/usb/002/%03d\nE: BUSNUM=002\nE: DEVNUM=%03d\nE: MAJOR=189\nE: MINOR=%d\n"
-             "E: PRODUCT=%x/%x/%x\nE: TYPE=255/0/0\nA: busnum=2\\n\nA: devnum=%d\\n\nA: devpath=%d\\n\nA: idVendor=%04x\\n\nA: idProduct=%04x\\n\nA: bcdDevice=%02x%02x\\n\nA: serial=%s\\n\n"
-             "A: speed=12\\n\nA: bConfigurationValue=1\\n\nA: bDeviceClass=%02x\\n\nA: dev=189:%d\\n\nH: descriptors=%s\n",
-             root, port, number, number, number, 127 + number, vendor, product, descriptors[12] | descriptors[13] << 8, number, port, vendor, product, descriptors[13], descriptors[12], serial,
-             descriptors[4], 127 + number, hex);
+             "P: %s\nN: bus/usb/%03d/%03d\nE: SUBSYSTEM=usb\nE: DEVTYPE=usb_device\nE: DEVNAME=%s\nE: BUSNUM=%03d\nE: DEVNUM=%03d\nE: MAJOR=189\nE: MINOR=%d\n"
+             "E: PRODUCT=%x/%x/%x\nE: TYPE=%d/%d/%d\n%sA: busnum=%d\\n\nA: devnum=%d\\n\nA: devpath=%s\\n\nA: idVendor=%04x\\n\nA: idProduct=%04x\\n\nA: bcdDevice=%02x%02x\\n\nA: serial=%s\\n\n"
+             "A: speed=%d\\n\nA: bConfigurationValue=1\\n\nA: bDeviceClass=%02x\\n\nA: dev=189:%d\\n\nH: descriptors=%s\n",
+             path, bus, number, u->node, bus, number, minor, vendor, product, descriptors[12] | descriptors[13] << 8, descriptors[4], descriptors[5], descriptors[6],
+             u->ops->properties ? u->ops->properties : "", bus, number, ports, vendor, product, descriptors[13], descriptors[12], serial, u->ops->speed_mbit, descriptors[4], minor, hex);
     return add(u->bed, text);
 }
 
@@ -374,9 +419,7 @@ void usbfs_unplug(struct usbfs *u)
 {
     pthread_mutex_lock(&u->lock);
     u->gone = true;
-    for (int i = 0; i < u->n_urbs; i++)
-        if (!u->urb[i].done)
-            finish(&u->urb[i], -ESHUTDOWN);
+    finish_all(u, -ESHUTDOWN);
     u->ops->unplugged(u->device);
     pthread_mutex_unlock(&u->lock);
     umockdev_testbed_detach_ioctl(u->bed, u->node, NULL);
