@@ -51,8 +51,10 @@ if [ -n "$scene" ]; then
 elif [ "$n_cameras" -gt 0 ]; then
     studio=$out/studio
     step "studio: $n_cameras views of one Disney material in a room lit by 16,384 small lights, with a known answer (data set D3)"
-    # A panorama whose texels are as large as what the lens resolves: smaller ones could not be photographed in their place.
-    "$rigsolve" synth D3 -o "$studio" --size 720x480 --views "$n_cameras" --true-lights 16384 --panorama-width 512 --seed 1 --samples 2
+    # A panorama whose texels are as large as what the fisheye resolves: smaller ones could not be photographed in their place.
+    size=720x480 panorama_px=512
+    [ "$n_cameras" -le 24 ] || size=480x320 panorama_px=256
+    "$rigsolve" synth D3 -o "$studio" --size $size --views "$n_cameras" --true-lights 16384 --panorama-width $panorama_px --seed 1 --samples 2
 else
     studio=$out/take
     step "studio: 85 views of one Disney material in a room lit by 16,384 small lights, with a known answer (data set D3)"
