@@ -189,7 +189,9 @@ fuzz: deps deps-fuzz $(FUZZ_PROGRAMS)
 	@printf '%s\n' $(FUZZ_PROGRAMS) | xargs -P 2 -I{} sh tests/fuzz/run.sh {} $(FUZZ_SECONDS)
 
 # ---- demonstration, measurements ------------------------------------------------------------------------------------------
+# The button is the trigger board's where its simulation can be built.
 demo: deps all
+	@$(MAKE) --no-print-directory $(BUILD)/tests/board/boardsim || echo 'demo: no boardsim here: the trigger is simulated by rigsim alone'
 	@BIN=$(BUILD)/bin sh tests/demo.sh build/demo
 
 HAVE_CERES := $(wildcard /usr/include/ceres/jet.h)
@@ -273,7 +275,7 @@ clean:
 	rm -rf build
 help:
 	@echo 'make            the programs, in build/bin/       make test      everything that must hold (installs packages)'
-	@echo 'make demo       a synthetic studio, end to end    make fuzz      libFuzzer on every parser (FUZZ_SECONDS=60)'
+	@echo 'make demo       one button, end to end             make fuzz      libFuzzer on every parser (FUZZ_SECONDS=60)'
 	@echo 'make firmware   the image of the trigger board    make bench-firmware  its latencies, edges, a long fuzz'
 	@echo 'make test-vm    GPIO on a simulated chip, in a virtual machine'
 	@echo 'make bench      seconds and errors of kernels     make chart     speed against accuracy      make stability  where it fails'
