@@ -27,7 +27,7 @@ check() { # name, command...
         tail -20 "$D/rigd.log" 2>/dev/null | sed 's/^/#   /'
     fi
 }
-port=$((22000 + $$ % 1900 * 20))
+port=$((10000 + $$ % 1100 * 20))
 simulate="$BIN/rigsim --cameras $CAMERAS --personality nikon --port $port --seed 3 --raw-size 408x272 --set lag_ms=60 --set lag_spread_ms=12 --set lag_jitter_ms=0.05 --trigger-socket $D/t"
 # full-press on the outputs of the first register, half-press on the second, relays on the third
 {

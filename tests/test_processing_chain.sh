@@ -87,7 +87,7 @@ echo iVBORw0KGgoAAAANSUhEUgAAAAEAAAABCAQAAAC1HAwCAAAAC0lEQVR42mNk+A8AAQUBAScY42Y
 chmod +x "$D"/tools/*
 ln -s "$BIN/rigd-contact" "$D/tools/rigd-contact"
 
-port=$((10000 + $$ % 450 * 20))
+port=$((10000 + $$ % 1100 * 20))
 cat >"$D/rigd.conf" <<E1
 [rig]
 takes = $D/takes
