@@ -175,7 +175,7 @@ deps-bench: deps ; $(call install_packages,$(PACKAGES_BENCH))
 TEST_PROGRAMS := $(addprefix $(BUILD)/tests/,$(TESTS))
 TEST_SCRIPTS := $(wildcard tests/check_*.sh tests/test_*.sh)
 test: deps all $(TEST_PROGRAMS) $(BUILD)/tests/board/boardsim
-	@CMOCKA_MESSAGE_OUTPUT=TAP BIN=$(BUILD)/bin prove -j $(shell nproc) --timer --merge --exec '' $(TEST_PROGRAMS) $(TEST_SCRIPTS)
+	@CMOCKA_MESSAGE_OUTPUT=TAP BIN=$(BUILD)/bin prove -j $(shell nproc) --timer --merge --failures --comments --exec '' $(TEST_PROGRAMS) $(TEST_SCRIPTS)
 test-vm: deps $(BUILD)/tests/vm/test_gpio_vm
 	@prove --timer --verbose --exec '' tests/vm/run.sh :: $(BUILD)/vm $(BUILD)/tests/vm/test_gpio_vm
 check-includes:

@@ -30,20 +30,20 @@ sub up {
         return if $is_there->();
         if (waitpid($self->{$which}, POSIX::WNOHANG)) {
             delete $self->{$which};
-            die "$program has ended:\n", $self->logs;
+            die "# $program has ended\n", $self->logs;
         }
     }
-    die "$program is not there after 20 s:\n", $self->logs;
+    die "# $program is not there after 20 s\n", $self->logs;
 }
 
-# The end of what both said.
+# The end of what both said, as comments of TAP.
 sub logs {
     my ($self) = @_;
     my $text = '';
     for my $name (qw(sim rigd)) {
         open my $f, '<', "$self->{dir}/$name.log" or next;
         my @lines = <$f>;
-        $text .= "$name.log: $_" for @lines > 15 ? @lines[-15 .. -1] : @lines;
+        $text .= "# $name.log: $_" for @lines > 15 ? @lines[-15 .. -1] : @lines;
     }
     return $text;
 }

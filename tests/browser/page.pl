@@ -10,7 +10,7 @@ use Time::HiRes qw(sleep);
 plan skip_all => 'no chromium here (apt-get install chromium)' unless Browser::find();
 my $rig = Rig->new(6);
 $rig->start;
-END { if ($rig && !Test::More->builder->is_passing) { local $?; diag $rig->logs } }
+END { if ($rig && !Test::More->builder->is_passing) { local $?; print STDERR $rig->logs } }
 my $profile = File::Temp::tempdir(CLEANUP => 1);
 my $page = Browser->open($rig->url, $profile);
 my $text = sub { $page->js("document.querySelector('$_[0]').textContent") };
