@@ -14,7 +14,7 @@ MACHINE := $(shell uname -m)
 PACKAGES := gcc make pkg-config libopenexr-dev libembree-dev libassimp-dev libjansson-dev libtiff-dev libpng-dev libjpeg-dev libexpat1-dev liblapacke-dev libopenblas-dev libcmocka-dev perl help2man dcraw \
   libgphoto2-dev libgpiod-dev libinih-dev libmicrohttpd-dev libraw-dev libsystemd-dev libumockdev-dev umockdev libusb-1.0-0-dev libxxhash-dev \
   gcc-avr avr-libc libsimavr-dev libelf-dev
-PACKAGES_TEST := chromium
+PACKAGES_TEST := chromium gphoto2 libimage-exiftool-perl hugin-tools libsuitesparse-dev
 PACKAGES_FUZZ := clang libclang-rt-dev
 PACKAGES_BENCH := libceres-dev g++ gnuplot-nox
 
