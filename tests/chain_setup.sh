@@ -4,7 +4,7 @@
 # same time cannot meet. What cannot come any more is not waited for: the logs of rigsim and rigd are shown, and that is the end.
 BIN=$(cd "${BIN:-build/bin}" && pwd) || exit 1
 D=$(mktemp -d "${TMPDIR:-/tmp}/studiorig-test-XXXXXX") || exit 1
-n=0 failed=0 rigd='' sim=''
+n=0 failed=0 rigd='' sim='' seen_sim=0 seen_rigd=0
 export RIGD_SOCKET="$D/s"
 rigsim="$BIN/rigsim --address 127.$((1 + ($$ >> 16 & 127))).$(($$ >> 8 & 255)).$(($$ & 255)) --personality nikon --raw-size 408x272 --trigger-socket $D/t"
 finish() {
@@ -13,8 +13,13 @@ finish() {
     rm -rf "$D"
 }
 trap finish EXIT
-logs() {
-    for log in sim rigd; do tail -12 "$D/$log.log" 2>/dev/null | sed "s/^/# $log.log: /"; done
+logs() { # what both said since the last time
+    for log in sim rigd; do
+        [ -f "$D/$log.log" ] || continue
+        eval "seen=\$seen_$log"
+        tail -n +$((seen + 1)) "$D/$log.log" | tail -n 20 | sed "s/^/# $log.log: /"
+        eval "seen_$log=$(wc -l <"$D/$log.log")"
+    done
 }
 check() { # name, command...
     n=$((n + 1)) name=$1
