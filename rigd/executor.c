@@ -13,6 +13,7 @@
 #include <stdlib.h>
 #include <string.h>
 #include <sys/epoll.h>
+#include <sys/mman.h>
 #include <sys/prctl.h>
 #include <sys/resource.h>
 #include <sys/syscall.h>
@@ -39,8 +40,10 @@ struct running {
 
 struct executor {
     struct executor_host host;
-    int epoll_fd;
+    int epoll_fd, shared_fd;
     struct running *job[EXECUTOR_JOBS_MAX];
+    // Process group of each job's program, written by its keeper in memory that both have; 0: none, or it was seen to.
+    volatile pid_t *group;
 };
 
 // ---- commands -----------------------------------------------------------------------------------------------------------------
@@ -115,7 +118,7 @@ __attribute__((noreturn)) static void become(const struct executor_command *c, c
     _exit(127);
 }
 
-__attribute__((noreturn)) static void keep(const struct executor_command *c, char **envp, const int *fd, pid_t daemon)
+__attribute__((noreturn)) static void keep(const struct executor_command *c, char **envp, const int *fd, pid_t daemon, int shared_fd, volatile pid_t *group)
 {
     sigset_t all;
     siginfo_t info;
@@ -132,10 +135,13 @@ __attribute__((noreturn)) static void keep(const struct executor_command *c, cha
     const pid_t pid = fork();
     if (pid == 0)
         become(c, envp, fd, self);
-    syscall(SYS_close_range, 0U, ~0U, 0); // the workers' sockets, the trigger's lines: not ours to hold
+    if (shared_fd > 0) // the workers' sockets, the trigger's lines: not ours to hold
+        syscall(SYS_close_range, 0U, (unsigned)shared_fd - 1, 0);
+    syscall(SYS_close_range, (unsigned)(shared_fd + 1), ~0U, 0);
     if (pid < 0)
         _exit(127);
     setpgid(pid, pid);
+    *group = pid;
     for (;;) {
         const int s = sigwaitinfo(&all, &info);
         if (s == SIGTERM) {
@@ -151,7 +157,8 @@ __attribute__((noreturn)) static void keep(const struct executor_command *c, cha
             memset(&info, 0, sizeof(info));
             if (waitid(P_PID, (id_t)pid, &info, WEXITED | WNOHANG | WNOWAIT) || !info.si_pid)
                 continue;
-            kill(-pid, SIGKILL); // what it left behind; the group's number is not reused before the next line
+            kill(-pid, SIGKILL); // what it left behind; the group's number is not reused before it is waited for
+            *group = 0;
             waitpid(pid, &status, 0);
             break;
         }
@@ -261,11 +268,12 @@ int executor_start(struct executor *e, const struct executor_command *c)
     if (!err) {
         const pid_t self = getpid();
         sigset_t all, old;
+        e->group[job] = 0;
         sigfillset(&all);
         pthread_sigmask(SIG_BLOCK, &all, &old); // nothing of the daemon's is to run in the fork
         r->keeper = fork();
         if (r->keeper == 0)
-            keep(c, envp, theirs, self);
+            keep(c, envp, theirs, self, e->shared_fd, &e->group[job]);
         err = r->keeper < 0 ? -errno : 0;
         pthread_sigmask(SIG_SETMASK, &old, NULL);
     }
@@ -348,6 +356,8 @@ static void end(struct executor *e, int job)
     int status;
     if (waitpid(r->keeper, &status, WNOHANG) != r->keeper)
         return;
+    if (e->group[job] > 0) // the keeper was killed: the kernel ended the program, but not its children
+        kill(-e->group[job], SIGKILL);
     for (int k = 0; k < N_STREAMS; k++)
         hear(e, job, k, true);
     for (int k = 0; k < N_STREAMS; k++) // a last line without its end
@@ -387,13 +397,18 @@ int executor_open(struct executor **out, const struct executor_host *host)
     if (!e)
         return -ENOMEM;
     e->host = *host;
+    e->shared_fd = -1;
     e->epoll_fd = epoll_create1(EPOLL_CLOEXEC);
-    if (e->epoll_fd < 0) {
+    void *shared = mmap(NULL, EXECUTOR_JOBS_MAX * sizeof(pid_t), PROT_READ | PROT_WRITE, MAP_SHARED | MAP_ANONYMOUS, -1, 0);
+    if (e->epoll_fd < 0 || shared == MAP_FAILED) {
         const int err = -errno;
         log_error("executor: cannot watch processes: %s", strerror(-err));
+        if (e->epoll_fd >= 0)
+            close(e->epoll_fd);
         free(e);
         return err;
     }
+    e->group = shared;
     *out = e;
     return 0;
 }
@@ -410,8 +425,14 @@ void executor_close(struct executor *e)
             waitpid(e->job[i]->keeper, NULL, 0); // SIGKILL is on its way to all of them
             forget(e, i);
         }
+    munmap((void *)(uintptr_t)e->group, EXECUTOR_JOBS_MAX * sizeof(pid_t));
     close(e->epoll_fd);
     free(e);
+}
+
+void executor_share(struct executor *e, int fd)
+{
+    e->shared_fd = fd;
 }
 
 int executor_fd(const struct executor *e)

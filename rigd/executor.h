@@ -2,7 +2,7 @@
 //
 // Between the daemon and each program stands a keeper (a fork of the daemon, without its descriptors): it has the program's process
 // group to itself. However the daemon ends, the kernel tells the keeper, and the keeper kills the whole group - a hook's children,
-// too. Programs run at nice 10, are the first to go when memory ends, and see no descriptor but 0, 1, 2 and, if wanted, 3.
+// too. A keeper that is killed takes its program with it, and the daemon kills the rest of the group. Programs run at nice 10, are the first to go when memory ends, and see no descriptor but 0, 1, 2 and, if wanted, 3.
 //
 // What they say is heard in bounded pieces: lines of at most EXECUTOR_LINE_MAX bytes, the rest of longer ones is dropped.
 // Loop thread only; nothing here waits, but executor_close().
@@ -37,6 +37,8 @@ struct executor_host {
 
 struct executor;
 int executor_open(struct executor **out, const struct executor_host *host); // host is copied. 0 or -errno (logged)
+// Every keeper holds fd open until its program is gone: a lock (flock) on it outlives the daemon exactly as long as its work does.
+void executor_share(struct executor *e, int fd); // stays the caller's; before the first start
 void executor_close(struct executor *e); // kills and reaps what runs, without telling; NULL allowed
 int executor_fd(const struct executor *e); // readable: call dispatch
 void executor_dispatch(struct executor *e);
