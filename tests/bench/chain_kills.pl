@@ -2,14 +2,14 @@
 # tests/bench/chain_kills.pl [KILLS [ROUNDS]] - kill -9 of any process at any stage of the chain, and what becomes of the take.
 #
 # Each round is a fresh rig of the real programs: rigsim's cameras before a small synthetic studio, rigd, an operator who shoots a panorama
-# and a take with rigctl and waits until it is solved. Meanwhile KILLS processes in all (60) are killed: rigd, a worker, any program of the
+# and two takes with rigctl - the second while the first is developed and solved - and waits until they are solved. Meanwhile KILLS processes in all (60) are killed: rigd, a worker, any program of the
 # chain, the keeper between rigd and a program, the operator's rigctl, several at once, all at once. rigd is started again each time.
 # In the end, in every round (20):
 #  - each take is solved, or says what is missing, and rigctl process then brings it there;
 #  - each frame in a take is what its ledger and its manifest say, and what the card holds (gphoto2); none is lost, none is there twice;
 #  - each product is what the programs make of the same input when nobody disturbs them, byte for byte but for times;
 #  - nothing half is under a final name or left over, no process is left behind, and none worked on beside its successor.
-# Environment: BIN (build/bin), SEED (1), STOPS of the panorama head ("0,0; 180,0"), KEEP=1 keeps all folders, KEEP_BAD=DIR those of rounds
+# Environment: BIN (build/bin), SEED (1), STOPS of the panorama head ("0,0; 180,0"), TAKES (2), KEEP=1 keeps all folders, KEEP_BAD=DIR those of rounds
 # that went wrong, TARGETS="rigd-develop,all" what is killed in each round, in this order (random), VERBOSE=1 tells each kill. Without gphoto2 the cards are not looked at. Exit 1: one of these is not so.
 use strict;
 use warnings;
@@ -30,6 +30,7 @@ my $SEED = $ENV{SEED} // 1;
 my $CAMERAS = 6; # and one on the panorama head
 my $OPTIONS = '--texture 16 --lights 16 --sub-lights 1 --material-lights 64 --bounces 0 --hold-out every:6';
 my $STOPS = $ENV{STOPS} // '0,0; 180,0'; # of the panorama head
+my @TAKES = (qw(vase bowl))[0 .. ($ENV{TAKES} // 2) - 1];
 my $ROUND_S = 240; # longer, and it hangs
 my $address = sprintf '127.%d.%d.%d', 1 + ($$ >> 16 & 127), $$ >> 8 & 255, $$ & 255; # tests/loopback.h
 my $home = tempdir('studiorig-bench-XXXXXX', DIR => -w '/dev/shm' ? '/dev/shm' : $ENV{TMPDIR} // '/tmp', CLEANUP => !$ENV{KEEP});
@@ -141,7 +142,7 @@ sub operate {
         }
         return 0;
     };
-    for my $what (['lights', 'panorama'], ['vase', 'capture']) {
+    for my $what (['lights', 'panorama'], map { [$_, 'capture'] } @TAKES) {
         my %resumed;
         while ($ready->()) {
             my $take = newest($r, $what->[0]);
@@ -157,7 +158,7 @@ sub operate {
         }
     }
     my $watch = launch("$r->{dir}/watch.log", "$BIN/rigctl", 'events');
-    for my $name (qw(lights vase)) {
+    for my $name ('lights', @TAKES) {
         my $take = newest($r, $name) // next;
         my $settled = sub { for (; time < $end; sleep .1) { return 1 if (ledger($take)->{processing}{state} // '') =~ /settled|cancelled/ } return 0 };
         while ($settled->() && lacks($take) && $o{processed}++ < 4) {
@@ -181,19 +182,17 @@ my %table; # {target}{stage} => n
 sub stage {
     my ($r) = @_;
     my %running = map { $_->[1] => $_->[0] } chain($r->{rigd});
+    for my $name (reverse('lights', @TAKES)) {
+        my $state = ledger(newest($r, $name) // next)->{state} // next;
+        return ($name eq 'lights' ? 'panorama' : 'take') . (grep({ is_program($_) } keys %running) ? ', work paused' : '') if $state =~ /preflight|armed|exposing|collecting/;
+        last;
+    }
     if ($running{rigsolve}) { return (slurp("/proc/$running{rigsolve}/cmdline") // '') =~ /preview/ ? 'preview' : 'standard' }
     return 'reconstruct' if $running{hook};
     return 'merge' if $running{'rigd-panorama'};
     return 'develop' if $running{'rigd-develop'};
     return 'sheet' if $running{'rigd-contact'};
-    for my $name (qw(vase lights)) {
-        my $l = ledger(newest($r, $name) // next);
-        next if !$l->{state};
-        return ($name eq 'vase' ? 'take: ' : 'panorama: ') . $l->{state} if $l->{state} =~ /armed|exposing|collecting/;
-        return 'settled' if $name eq 'vase' && ($l->{processing}{state} // '') eq 'settled';
-        return 'between';
-    }
-    return 'start';
+    return 'between';
 }
 
 sub victims { # of a target: pids, or none as yet
@@ -238,7 +237,7 @@ sub one_round {
     };
     KILL: for ($n = 0; $n < $n_kills && !$is_over->(); $n++) {
         my $target = $ENV{TARGETS} ? (split /,/, $ENV{TARGETS})[$n] // last : $targets[rand @targets];
-        my $at = time + ($lasts_s{$target} || $target eq 'rigd while solving' ? 0 : rand(16 / max(1, $n_kills)));
+        my $at = time + ($lasts_s{$target} || $target eq 'rigd while solving' ? 0 : rand(18 / max(1, $n_kills)));
         my $give_up = time + 20;
         while (time < $at) { $step->(); last KILL if $is_over->() }
         my @victims;
@@ -312,7 +311,7 @@ sub audit {
     reap($r->{rigd});
     chomp(my @left = `find $r->{takes} -name '*.part' -o -name '.?*' ! -name '.processing.lock' -o -name '*.damaged'`);
     $complain->("left over: $_") for @left;
-    for my $take (map { newest($r, $_) // () } qw(lights vase)) {
+    for my $take (map { newest($r, $_) // () } 'lights', @TAKES) {
         if (my $lacks = lacks($take)) { $complain->("$take lacks $lacks") }
         compare_products($r, $take, $complain);
         for my $file (split /\n/, `find $take -name '*.json'`) { $complain->("$file is no JSON") if !read_json($file) }
@@ -389,9 +388,9 @@ for my $round (1 .. $N_ROUNDS) {
 }
 my %stages = map { $_ => 1 } map { keys %$_ } values %table;
 printf "\n%-24s", 'killed';
-printf '%20s', $_ for sort keys %stages;
+print "  $_" for sort keys %stages;
 print "\n";
-for my $target (sort keys %table) { printf "%-24s", $target; printf '%20s', $table{$target}{$_} // '' for sort keys %stages; print "\n" }
+for my $target (sort keys %table) { printf "%-24s", $target; printf '  %' . length($_) . 's', $table{$target}{$_} // '' for sort keys %stages; print "\n" }
 my @complaints = map { @{ $_->{complaints} } } @rounds;
 printf "\n%d kills in %d rounds (seed %d): %d rounds ended complete by themselves, %d after saying what was missing (rigctl process), %d with a take that failed and said why (rigctl resume, or shot again)\n", $killed, scalar @rounds,
     $SEED, scalar(grep { !$_->{said} && !$_->{failed} } @rounds), scalar(grep { $_->{said} } @rounds), scalar(grep { $_->{failed} } @rounds);
