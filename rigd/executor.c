@@ -5,6 +5,7 @@
 #include "rigd/executor.h"
 #include "solver/take/log.h"
 
+#include <assert.h>
 #include <errno.h>
 #include <fcntl.h>
 #include <signal.h>
@@ -40,7 +41,7 @@ struct running {
 
 struct executor {
     struct executor_host host;
-    int epoll_fd, shared_fd;
+    int epoll_fd, lock_fd; // -1: none
     struct running *job[EXECUTOR_JOBS_MAX];
     // Process group of each job's program, written by its keeper in memory that both have; 0: none, or it was seen to.
     volatile pid_t *group;
@@ -88,7 +89,24 @@ static void write_file(const char *path, const char *text, size_t n)
         close(fd);
 }
 
-__attribute__((noreturn)) static void become(const struct executor_command *c, char **envp, const int *fd, pid_t keeper)
+// From first on, but for one (-1: none).
+static void close_others(int first, int but)
+{
+    if (but > first)
+        syscall(SYS_close_range, (unsigned)first, (unsigned)but - 1, 0);
+    syscall(SYS_close_range, (unsigned)(but >= first ? but + 1 : first), ~0U, 0);
+}
+
+// Record locks: they end with the process, survive exec, and its children do not have them.
+int executor_lock_file(int fd, bool alone)
+{
+    struct flock lock = { .l_type = (short)(alone ? F_WRLCK : F_RDLCK), .l_whence = SEEK_SET };
+    if (!fcntl(fd, F_SETLK, &lock))
+        return 0;
+    return errno == EACCES || errno == EINTR ? -EAGAIN : -errno;
+}
+
+__attribute__((noreturn)) static void become(const struct executor_command *c, char **envp, const int *fd, pid_t keeper, int lock_fd)
 {
     sigset_t none;
     sigemptyset(&none);
@@ -106,7 +124,13 @@ __attribute__((noreturn)) static void become(const struct executor_command *c, c
     dup2(fd[ERR], 2);
     if (fd[PROGRESS] >= 0)
         dup2(fd[PROGRESS], 3);
-    syscall(SYS_close_range, fd[PROGRESS] >= 0 ? 4U : 3U, ~0U, 0);
+    if (lock_fd >= 0 && lock_fd != EXECUTOR_LOCK_FD)
+        dup2(lock_fd, EXECUTOR_LOCK_FD);
+    else if (lock_fd >= 0)
+        fcntl(lock_fd, F_SETFD, 0);
+    close_others(fd[PROGRESS] >= 0 ? 4 : 3, lock_fd >= 0 ? EXECUTOR_LOCK_FD : -1);
+    if (lock_fd >= 0 && executor_lock_file(EXECUTOR_LOCK_FD, false)) // last: closing any descriptor of the file would undo it
+        _exit(127);
     for (int s = 1; s < 32; s++)
         signal(s, SIG_DFL);
     sigprocmask(SIG_SETMASK, &none, NULL);
@@ -118,7 +142,7 @@ __attribute__((noreturn)) static void become(const struct executor_command *c, c
     _exit(127);
 }
 
-__attribute__((noreturn)) static void keep(const struct executor_command *c, char **envp, const int *fd, pid_t daemon, int shared_fd, volatile pid_t *group)
+__attribute__((noreturn)) static void keep(const struct executor_command *c, char **envp, const int *fd, pid_t daemon, int lock_fd, volatile pid_t *group)
 {
     sigset_t all;
     siginfo_t info;
@@ -132,12 +156,12 @@ __attribute__((noreturn)) static void keep(const struct executor_command *c, cha
     setrlimit(RLIMIT_CORE, &(struct rlimit){ 0, 0 });
     if (getppid() != daemon)
         _exit(127);
+    if (lock_fd >= 0 && executor_lock_file(lock_fd, false))
+        _exit(127); // the daemon has gone, and the next one is there
     const pid_t pid = fork();
     if (pid == 0)
-        become(c, envp, fd, self);
-    if (shared_fd > 0) // the workers' sockets, the trigger's lines: not ours to hold
-        syscall(SYS_close_range, 0U, (unsigned)shared_fd - 1, 0);
-    syscall(SYS_close_range, (unsigned)(shared_fd + 1), ~0U, 0);
+        become(c, envp, fd, self, lock_fd);
+    close_others(0, lock_fd); // the workers' sockets, the trigger's lines: not ours to hold
     if (pid < 0)
         _exit(127);
     setpgid(pid, pid);
@@ -273,7 +297,7 @@ int executor_start(struct executor *e, const struct executor_command *c)
         pthread_sigmask(SIG_BLOCK, &all, &old); // nothing of the daemon's is to run in the fork
         r->keeper = fork();
         if (r->keeper == 0)
-            keep(c, envp, theirs, self, e->shared_fd, &e->group[job]);
+            keep(c, envp, theirs, self, e->lock_fd, &e->group[job]);
         err = r->keeper < 0 ? -errno : 0;
         pthread_sigmask(SIG_SETMASK, &old, NULL);
     }
@@ -397,7 +421,7 @@ int executor_open(struct executor **out, const struct executor_host *host)
     if (!e)
         return -ENOMEM;
     e->host = *host;
-    e->shared_fd = -1;
+    e->lock_fd = -1;
     e->epoll_fd = epoll_create1(EPOLL_CLOEXEC);
     void *shared = mmap(NULL, EXECUTOR_JOBS_MAX * sizeof(pid_t), PROT_READ | PROT_WRITE, MAP_SHARED | MAP_ANONYMOUS, -1, 0);
     if (e->epoll_fd < 0 || shared == MAP_FAILED) {
@@ -430,9 +454,10 @@ void executor_close(struct executor *e)
     free(e);
 }
 
-void executor_share(struct executor *e, int fd)
+void executor_lock(struct executor *e, int fd)
 {
-    e->shared_fd = fd;
+    assert(fd > 3);
+    e->lock_fd = fd;
 }
 
 int executor_fd(const struct executor *e)

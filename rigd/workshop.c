@@ -17,7 +17,6 @@
 #include <string.h>
 #include <sys/epoll.h>
 #include <sys/eventfd.h>
-#include <sys/file.h>
 #include <sys/timerfd.h>
 #include <time.h>
 #include <unistd.h>
@@ -131,13 +130,14 @@ static void work(struct workshop *w, struct task *t)
 }
 
 // However a rigd ends, its programs need a moment to be gone, and a keeper that is stopped keeps its program: as long as any of them
-// is there, nothing of ours may touch what it writes. They hold the lock (executor_share). False: we are to end.
+// is there, nothing of ours may touch what it writes. They hold the lock (executor_lock). False: we are to end.
 static bool wait_for_predecessors(struct workshop *w)
 {
     bool go_on = true;
-    for (int n = 0; go_on && flock(w->lock_fd, LOCK_EX | LOCK_NB); n++) {
-        if (errno != EWOULDBLOCK && errno != EINTR) {
-            log_warning("workshop: %s/.processing.lock: %s; programs of an earlier rigd are not waited for", w->takes_dir, strerror(errno));
+    int err;
+    for (int n = 0; go_on && (err = executor_lock_file(w->lock_fd, true)); n++) {
+        if (err != -EAGAIN) {
+            log_warning("workshop: %s/.processing.lock: %s; programs of an earlier rigd cannot be waited for", w->takes_dir, strerror(-err));
             return true;
         }
         if (n == 100)
@@ -148,6 +148,8 @@ static bool wait_for_predecessors(struct workshop *w)
         go_on = !w->ends;
         pthread_mutex_unlock(&w->lock);
     }
+    if (go_on)
+        executor_lock_file(w->lock_fd, false); // ours share it
     return go_on;
 }
 
@@ -736,7 +738,7 @@ int workshop_open(struct workshop **out, const struct config *config, const char
     if (!err)
         err = executor_open(&w->executor, &hands);
     if (!err)
-        executor_share(w->executor, w->lock_fd);
+        executor_lock(w->executor, w->lock_fd);
     if (!err)
         err = w->epoll_fd < 0 ? -errno : watch(w, w->timer_fd);
     if (!err)
