@@ -349,7 +349,7 @@ sub compare_products {
     my ($r, $take, $complain) = @_;
     my $l = ledger($take);
     my $same = sub { my ($here, $there) = @_; $complain->("$here is not what undisturbed programs make") if !-s $here || md5($here) ne md5($there) };
-    my $out = "$r->{dir}/again";
+    my $out = "$r->{dir}/again-" . $take =~ s{.*/}{}r;
     my $log = "$r->{dir}/again.log";
     mkdir $out;
     if ($l->{kind} && $l->{kind} eq 'panorama') {
