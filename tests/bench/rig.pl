@@ -314,7 +314,7 @@ sub audit {
             }
         }
     }
-    chomp(my @parts = `find $r->{takes} -name '*.part*' -o -name '.*' -type f`);
+    chomp(my @parts = `find $r->{takes} -name '*.part*' -o -name '.*' -type f ! -name .processing.lock`);
     $complain->("left over: $_") for @parts;
     # The cards, by the stock client.
     end(delete $r->{rigd});
