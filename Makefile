@@ -53,10 +53,10 @@ FUZZED := $(LIBRARY) $(RIG) $(RIGSIM_LIB) $(FIRMWARE_SIM) # what a fuzzer calls 
 
 # ---- rules --------------------------------------------------------------------------------------------------------------
 object = $(patsubst %.c,$(BUILD)/obj/%.o,$(1))
-ifneq ($(filter firmware test test-vm demo bench bench-develop bench-firmware bench-panorama bench-rig chart figure5 figures stability experiments,$(MAKECMDGOALS)),)
+ifneq ($(filter firmware test test-vm demo bench bench-chain bench-develop bench-firmware bench-panorama bench-rig chart figure5 figures stability experiments,$(MAKECMDGOALS)),)
 FIRST := deps # these install what is missing before the first file is compiled
 endif
-.PHONY: all firmware deps deps-test deps-fuzz deps-bench test test-vm demo bench bench-develop bench-firmware bench-panorama bench-rig chart figure5 figures stability experiments fuzz check-includes man install clean help
+.PHONY: all firmware deps deps-test deps-fuzz deps-bench test test-vm demo bench bench-chain bench-develop bench-firmware bench-panorama bench-rig chart figure5 figures stability experiments fuzz check-includes man install clean help
 .DELETE_ON_ERROR:
 .SECONDARY:
 
@@ -211,6 +211,9 @@ bench-firmware: deps $(BUILD)/tests/bench/bench_firmware
 RIG_BENCHES ?= scale faults soak lag full eio kills
 bench-rig: deps all
 	@for b in $(RIG_BENCHES); do echo "== $$b"; BIN=$(BUILD)/bin perl tests/bench/rig.pl $$b || failed=1; done; [ -z "$$failed" ]
+CHAIN_KILLS ?= 100 20
+bench-chain: deps all
+	@BIN=$(BUILD)/bin perl tests/bench/chain_kills.pl $(CHAIN_KILLS)
 bench-develop: deps all $(BUILD)/tests/bench/raws
 	@BIN=$(BUILD)/bin RAWS=$(BUILD)/tests/bench/raws sh tests/bench/develop.sh
 experiments: deps $(BUILD)/bin/rigsolve $(BUILD)/tests/bench/judge
@@ -283,6 +286,7 @@ help:
 	@echo 'make bench      seconds and errors of kernels     make chart     speed against accuracy      make stability  where it fails'
 	@echo 'make bench-panorama  what a merged panorama loses of the one that was photographed, and what 24 megapixels take'
 	@echo 'make bench-rig  the rig with simulated cameras: kills, faults, scale, soak, lag, disks (half an hour; RIG_BENCHES="lag soak")'
+	@echo 'make bench-chain  kill -9 of any process from the cameras to the solve, then every byte is looked at (CHAIN_KILLS="100 20": in 20 rounds)'
 	@echo 'make bench-develop  raws to radiance: seconds and MB per 24-megapixel frame, 85 of them sustained'
 	@echo 'make install    DESTDIR= PREFIX=/usr/local        make deps      Debian packages             make clean'
 	@echo 'variants: VARIANT=debug|asan|tsan; V=1 shows commands'

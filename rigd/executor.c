@@ -5,6 +5,7 @@
 #include "rigd/executor.h"
 #include "solver/take/log.h"
 
+#include <assert.h>
 #include <errno.h>
 #include <fcntl.h>
 #include <signal.h>
@@ -13,6 +14,7 @@
 #include <stdlib.h>
 #include <string.h>
 #include <sys/epoll.h>
+#include <sys/mman.h>
 #include <sys/prctl.h>
 #include <sys/resource.h>
 #include <sys/syscall.h>
@@ -39,8 +41,10 @@ struct running {
 
 struct executor {
     struct executor_host host;
-    int epoll_fd;
+    int epoll_fd, lock_fd; // -1: none
     struct running *job[EXECUTOR_JOBS_MAX];
+    // Process group of each job's program, written by its keeper in memory that both have; 0: none, or it was seen to.
+    volatile pid_t *group;
 };
 
 // ---- commands -----------------------------------------------------------------------------------------------------------------
@@ -85,7 +89,24 @@ static void write_file(const char *path, const char *text, size_t n)
         close(fd);
 }
 
-__attribute__((noreturn)) static void become(const struct executor_command *c, char **envp, const int *fd, pid_t keeper)
+// From first on, but for one (-1: none).
+static void close_others(int first, int but)
+{
+    if (but > first)
+        syscall(SYS_close_range, (unsigned)first, (unsigned)but - 1, 0);
+    syscall(SYS_close_range, (unsigned)(but >= first ? but + 1 : first), ~0U, 0);
+}
+
+// Record locks: they end with the process, survive exec, and its children do not have them.
+int executor_lock_file(int fd, bool alone)
+{
+    struct flock lock = { .l_type = (short)(alone ? F_WRLCK : F_RDLCK), .l_whence = SEEK_SET };
+    if (!fcntl(fd, F_SETLK, &lock))
+        return 0;
+    return errno == EACCES || errno == EINTR ? -EAGAIN : -errno;
+}
+
+__attribute__((noreturn)) static void become(const struct executor_command *c, char **envp, const int *fd, pid_t keeper, int lock_fd)
 {
     sigset_t none;
     sigemptyset(&none);
@@ -103,7 +124,13 @@ __attribute__((noreturn)) static void become(const struct executor_command *c, c
     dup2(fd[ERR], 2);
     if (fd[PROGRESS] >= 0)
         dup2(fd[PROGRESS], 3);
-    syscall(SYS_close_range, fd[PROGRESS] >= 0 ? 4U : 3U, ~0U, 0);
+    if (lock_fd >= 0 && lock_fd != EXECUTOR_LOCK_FD)
+        dup2(lock_fd, EXECUTOR_LOCK_FD);
+    else if (lock_fd >= 0)
+        fcntl(lock_fd, F_SETFD, 0);
+    close_others(fd[PROGRESS] >= 0 ? 4 : 3, lock_fd >= 0 ? EXECUTOR_LOCK_FD : -1);
+    if (lock_fd >= 0 && executor_lock_file(EXECUTOR_LOCK_FD, false)) // last: closing any descriptor of the file would undo it
+        _exit(127);
     for (int s = 1; s < 32; s++)
         signal(s, SIG_DFL);
     sigprocmask(SIG_SETMASK, &none, NULL);
@@ -115,7 +142,7 @@ __attribute__((noreturn)) static void become(const struct executor_command *c, c
     _exit(127);
 }
 
-__attribute__((noreturn)) static void keep(const struct executor_command *c, char **envp, const int *fd, pid_t daemon)
+__attribute__((noreturn)) static void keep(const struct executor_command *c, char **envp, const int *fd, pid_t daemon, int lock_fd, volatile pid_t *group)
 {
     sigset_t all;
     siginfo_t info;
@@ -129,13 +156,16 @@ __attribute__((noreturn)) static void keep(const struct executor_command *c, cha
     setrlimit(RLIMIT_CORE, &(struct rlimit){ 0, 0 });
     if (getppid() != daemon)
         _exit(127);
+    if (lock_fd >= 0 && executor_lock_file(lock_fd, false))
+        _exit(127); // the daemon has gone, and the next one is there
     const pid_t pid = fork();
     if (pid == 0)
-        become(c, envp, fd, self);
-    syscall(SYS_close_range, 0U, ~0U, 0); // the workers' sockets, the trigger's lines: not ours to hold
+        become(c, envp, fd, self, lock_fd);
+    close_others(0, lock_fd); // the workers' sockets, the trigger's lines: not ours to hold
     if (pid < 0)
         _exit(127);
     setpgid(pid, pid);
+    *group = pid;
     for (;;) {
         const int s = sigwaitinfo(&all, &info);
         if (s == SIGTERM) {
@@ -151,7 +181,8 @@ __attribute__((noreturn)) static void keep(const struct executor_command *c, cha
             memset(&info, 0, sizeof(info));
             if (waitid(P_PID, (id_t)pid, &info, WEXITED | WNOHANG | WNOWAIT) || !info.si_pid)
                 continue;
-            kill(-pid, SIGKILL); // what it left behind; the group's number is not reused before the next line
+            kill(-pid, SIGKILL); // what it left behind; the group's number is not reused before it is waited for
+            *group = 0;
             waitpid(pid, &status, 0);
             break;
         }
@@ -261,11 +292,12 @@ int executor_start(struct executor *e, const struct executor_command *c)
     if (!err) {
         const pid_t self = getpid();
         sigset_t all, old;
+        e->group[job] = 0;
         sigfillset(&all);
         pthread_sigmask(SIG_BLOCK, &all, &old); // nothing of the daemon's is to run in the fork
         r->keeper = fork();
         if (r->keeper == 0)
-            keep(c, envp, theirs, self);
+            keep(c, envp, theirs, self, e->lock_fd, &e->group[job]);
         err = r->keeper < 0 ? -errno : 0;
         pthread_sigmask(SIG_SETMASK, &old, NULL);
     }
@@ -348,6 +380,8 @@ static void end(struct executor *e, int job)
     int status;
     if (waitpid(r->keeper, &status, WNOHANG) != r->keeper)
         return;
+    if (e->group[job] > 0) // the keeper was killed: the kernel ended the program, but not its children
+        kill(-e->group[job], SIGKILL);
     for (int k = 0; k < N_STREAMS; k++)
         hear(e, job, k, true);
     for (int k = 0; k < N_STREAMS; k++) // a last line without its end
@@ -387,13 +421,18 @@ int executor_open(struct executor **out, const struct executor_host *host)
     if (!e)
         return -ENOMEM;
     e->host = *host;
+    e->lock_fd = -1;
     e->epoll_fd = epoll_create1(EPOLL_CLOEXEC);
-    if (e->epoll_fd < 0) {
+    void *shared = mmap(NULL, EXECUTOR_JOBS_MAX * sizeof(pid_t), PROT_READ | PROT_WRITE, MAP_SHARED | MAP_ANONYMOUS, -1, 0);
+    if (e->epoll_fd < 0 || shared == MAP_FAILED) {
         const int err = -errno;
         log_error("executor: cannot watch processes: %s", strerror(-err));
+        if (e->epoll_fd >= 0)
+            close(e->epoll_fd);
         free(e);
         return err;
     }
+    e->group = shared;
     *out = e;
     return 0;
 }
@@ -410,8 +449,15 @@ void executor_close(struct executor *e)
             waitpid(e->job[i]->keeper, NULL, 0); // SIGKILL is on its way to all of them
             forget(e, i);
         }
+    munmap((void *)(uintptr_t)e->group, EXECUTOR_JOBS_MAX * sizeof(pid_t));
     close(e->epoll_fd);
     free(e);
+}
+
+void executor_lock(struct executor *e, int fd)
+{
+    assert(fd > 3);
+    e->lock_fd = fd;
 }
 
 int executor_fd(const struct executor *e)

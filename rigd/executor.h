@@ -2,14 +2,14 @@
 //
 // Between the daemon and each program stands a keeper (a fork of the daemon, without its descriptors): it has the program's process
 // group to itself. However the daemon ends, the kernel tells the keeper, and the keeper kills the whole group - a hook's children,
-// too. Programs run at nice 10, are the first to go when memory ends, and see no descriptor but 0, 1, 2 and, if wanted, 3.
+// too. A keeper that is killed takes its program with it, and the daemon kills the rest of the group. Programs run at nice 10, are the first to go when memory ends, and see no descriptor but 0, 1, 2, if wanted 3, and a lock's.
 //
 // What they say is heard in bounded pieces: lines of at most EXECUTOR_LINE_MAX bytes, the rest of longer ones is dropped.
 // Loop thread only; nothing here waits, but executor_close().
 #pragma once
 #include <stdbool.h>
 
-enum { EXECUTOR_JOBS_MAX = 256, EXECUTOR_WORDS_MAX = 96, EXECUTOR_LINE_MAX = 16384 };
+enum { EXECUTOR_LOCK_FD = 40, EXECUTOR_JOBS_MAX = 256, EXECUTOR_WORDS_MAX = 96, EXECUTOR_LINE_MAX = 16384 };
 
 struct executor_command {
     char *word[EXECUTOR_WORDS_MAX + 1]; // word[0]: the program; looked for in PATH if it has no slash
@@ -37,6 +37,10 @@ struct executor_host {
 
 struct executor;
 int executor_open(struct executor **out, const struct executor_host *host); // host is copied. 0 or -errno (logged)
+// Every keeper and every program (not its children) holds a shared record lock on this file: who can lock it alone knows that nothing
+// of an earlier daemon is at work. fd is above 3 and stays the caller's; programs have it as EXECUTOR_LOCK_FD. Before the first start.
+void executor_lock(struct executor *e, int fd);
+int executor_lock_file(int fd, bool alone); // for this process, at once. 0 or -EAGAIN: others hold it; other -errno
 void executor_close(struct executor *e); // kills and reaps what runs, without telling; NULL allowed
 int executor_fd(const struct executor *e); // readable: call dispatch
 void executor_dispatch(struct executor *e);

@@ -466,7 +466,7 @@ int rig_resume(struct rig *r, int64_t now, struct ledger *old, const char *takes
         }
         b->part = c->expected;
         b->saw_nothing = false;
-        b->thumbed = true;
+        b->thumbed = !r->config->thumbnails; // for the contact sheet
         b->owed_due_ns = now + RECONCILE_MS * MS;
         if (!owes)
             continue;

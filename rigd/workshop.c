@@ -8,6 +8,7 @@
 #include "solver/take/log.h"
 
 #include <errno.h>
+#include <fcntl.h>
 #include <limits.h>
 #include <pthread.h>
 #include <sched.h>
@@ -72,6 +73,7 @@ struct workshop {
     struct bench **bench;
     int n_benches;
     int epoll_fd, timer_fd, answer_fd;
+    int lock_fd; // takes/.processing.lock
     pthread_t thread;
     bool thread_runs, obeying;
     pthread_mutex_t lock;
@@ -127,6 +129,30 @@ static void work(struct workshop *w, struct task *t)
     }
 }
 
+// However a rigd ends, its programs need a moment to be gone, and a keeper that is stopped keeps its program: as long as any of them
+// is there, nothing of ours may touch what it writes. They hold the lock (executor_lock). False: we are to end.
+static bool wait_for_predecessors(struct workshop *w)
+{
+    bool go_on = true;
+    int err;
+    for (int n = 0; go_on && (err = executor_lock_file(w->lock_fd, true)); n++) {
+        if (err != -EAGAIN) {
+            log_warning("workshop: %s/.processing.lock: %s; programs of an earlier rigd cannot be waited for", w->takes_dir, strerror(-err));
+            return true;
+        }
+        if (n == 100)
+            log_warning("workshop: programs of another rigd are at work in %s: takes are processed when they are gone; find them with fuser %s/.processing.lock", w->takes_dir,
+                        w->takes_dir);
+        nanosleep(&(struct timespec){ 0, 20000000 }, NULL);
+        pthread_mutex_lock(&w->lock);
+        go_on = !w->ends;
+        pthread_mutex_unlock(&w->lock);
+    }
+    if (go_on)
+        executor_lock_file(w->lock_fd, false); // ours share it
+    return go_on;
+}
+
 static void append(struct task **list, struct task *t)
 {
     t->next = NULL;
@@ -139,6 +165,8 @@ static void *thread(void *arg)
 {
     struct workshop *w = arg;
     const uint64_t one = 1;
+    if (!wait_for_predecessors(w))
+        return NULL;
     pthread_mutex_lock(&w->lock);
     while (!w->ends) {
         struct task *t = w->todo;
@@ -680,6 +708,7 @@ static int watch(struct workshop *w, int fd)
 int workshop_open(struct workshop **out, const struct config *config, const char *takes_dir, const struct workshop_host *host)
 {
     struct processing_settings settings;
+    char path[PATH_MAX];
     struct workshop *w = calloc(1, sizeof(*w));
     if (!w)
         return -ENOMEM;
@@ -691,15 +720,25 @@ int workshop_open(struct workshop **out, const struct config *config, const char
     w->epoll_fd = epoll_create1(EPOLL_CLOEXEC);
     w->timer_fd = timerfd_create(CLOCK_MONOTONIC, TFD_CLOEXEC | TFD_NONBLOCK);
     w->answer_fd = eventfd(0, EFD_CLOEXEC | EFD_NONBLOCK);
+    w->lock_fd = -1;
     w->wanted = configured(&config->process);
     settle_settings(w, config, &settings);
     w->site = (struct products_site){ .config = config, .takes_dir = w->takes_dir, .programs_dir = w->programs_dir,
                                       .n_threads = config->process.solve_threads ? config->process.solve_threads : settings.n_slots };
     int err = find_programs(w);
+    if (!err) {
+        snprintf(path, sizeof(path), "%s/.processing.lock", w->takes_dir);
+        w->lock_fd = open(path, O_RDWR | O_CREAT | O_CLOEXEC | O_NOFOLLOW, 0644);
+        err = w->lock_fd < 0 ? -errno : 0;
+        if (err)
+            log_error("workshop: %s: %s", path, strerror(-err));
+    }
     if (!err)
         err = processing_create(&w->processing, &settings);
     if (!err)
         err = executor_open(&w->executor, &hands);
+    if (!err)
+        executor_lock(w->executor, w->lock_fd);
     if (!err)
         err = w->epoll_fd < 0 ? -errno : watch(w, w->timer_fd);
     if (!err)
@@ -753,8 +792,8 @@ void workshop_close(struct workshop *w)
         free(w->bench[i]);
     }
     free(w->bench);
-    const int fds[] = { w->epoll_fd, w->timer_fd, w->answer_fd };
-    for (int i = 0; i < 3; i++)
+    const int fds[] = { w->epoll_fd, w->timer_fd, w->answer_fd, w->lock_fd };
+    for (int i = 0; i < 4; i++)
         if (fds[i] >= 0)
             close(fds[i]);
     free(w);

@@ -158,8 +158,8 @@ state_of() { grep -o '"state": *"[a-z]*"' "$1/take.json" | head -n 1 | cut -d'"'
 
 use_rig() {
     place_cameras
-    port=$((10000 + $$ % 200 * 100))
-    simulate="$bin/rigsim --cameras $((n_cameras + 1)) --personality nikon --port $port --seed 1 --raw-size $size_px --scene $out/scene --panorama $studio/panorama.exr --panorama-gain 0.0625 --trigger-socket $wires/wires"
+    address=127.$((1 + ($$ >> 16 & 127))).$(($$ >> 8 & 255)).$(($$ & 255)) # nobody else's on this machine (tests/loopback.h)
+    simulate="$bin/rigsim --cameras $((n_cameras + 1)) --personality nikon --address $address --seed 1 --raw-size $size_px --scene $out/scene --panorama $studio/panorama.exr --panorama-gain 0.0625 --trigger-socket $wires/wires"
     solve_options="--texture $texture --hold-out every:6"
     export RIGD_SOCKET="$wires/rigd"
     write_config simulated >"$out/rigd.conf"

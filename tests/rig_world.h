@@ -51,6 +51,7 @@ struct sim_camera {
     bool on_card[CARD_MAX * 100];
     int n_new;                        // not yet announced
     int take_first;                   // first object of the current take
+    int n_thumbnails;                 // that were fetched
     uint32_t seq;
     bool in_flight;
     struct camera_command command;
@@ -406,6 +407,7 @@ static inline void answer(int i)
         break;
     }
     case CAMERA_THUMBNAIL:
+        c->n_thumbnails++;
         hash_of(e.xxh128, i, 0);
         break;
     case CAMERA_DELETE: {

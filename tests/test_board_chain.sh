@@ -3,42 +3,15 @@
 # the real libusb, prepares the cameras and loads the shot, the board's edges press rigsim's shutters, their flash-sync contacts close the
 # board's inputs. Prints TAP. BIN, BOARDSIM: where the programs are.
 set -u
-BIN=${BIN:-build/bin} CAMERAS=${CAMERAS:-5}
+CAMERAS=${CAMERAS:-5}
+. tests/chain_setup.sh
 BOARDSIM=${BOARDSIM:-${BIN%/bin}/tests/board/boardsim}
 [ -x "$BOARDSIM" ] || { echo "1..0 # SKIP $BOARDSIM is not built"; exit 0; }
-D=$(mktemp -d "${TMPDIR:-/tmp}/studiorig-test-XXXXXX") || exit 1
-n=0 failed=0 board='' sim=''
-export RIGD_SOCKET="$D/s"
-finish() {
-    [ -n "$board" ] && kill "$board" 2>/dev/null && wait "$board" 2>/dev/null
-    [ -n "$sim" ] && kill "$sim" 2>/dev/null && wait "$sim" 2>/dev/null
-    rm -rf "$D"
-}
-trap finish EXIT
-check() { # name, command...
-    n=$((n + 1)) name=$1
-    shift
-    if "$@" >"$D/out" 2>&1; then
-        echo "ok $n - $name"
-    else
-        failed=1
-        echo "not ok $n - $name"
-        sed 's/^/#   /' "$D/out" | tail -20
-        tail -20 "$D/rigd.log" 2>/dev/null | sed 's/^/#   /'
-    fi
-}
-port=$((10000 + $$ % 1100 * 20))
-simulate="$BIN/rigsim --cameras $CAMERAS --personality nikon --port $port --seed 3 --raw-size 408x272 --set lag_ms=60 --set lag_spread_ms=12 --set lag_jitter_ms=0.05 --trigger-socket $D/t"
+rigsim="$rigsim --cameras $CAMERAS --seed 3 --set lag_ms=60 --set lag_spread_ms=12 --set lag_jitter_ms=0.05"
 # full-press on the outputs of the first register, half-press on the second, relays on the third
 {
+    rig_section
     cat <<E
-[rig]
-takes = $D/takes
-state = $D/state
-socket = $D/s
-personality_dir = $PWD/config/cameras
-raw_mb = 2
-free_space_mb = 1
 [settings]
 iso = 100
 shutter = 1/125
@@ -49,43 +22,31 @@ half_press_ms = 100
 hold_ms = 100
 max_hold_ms = 1000
 E
-    $simulate --list | awk '/^\[camera/ { in_camera = 1; i = n++ } !in_camera { next }
+    $rigsim --list | awk '/^\[camera/ { in_camera = 1; i = n++ } !in_camera { next }
         /^full_line/ { print "full_line = " i; next } /^half_line/ { print "half_line = " 8 + i; next }
         /^relay_line/ { print "relay_line = " 16 + i; next } { print }'
 } >"$D/rigd.conf"
-$simulate >"$D/sim.log" 2>&1 &
-sim=$!
-while [ ! -S "$D/t" ]; do kill -0 $sim || { echo "1..0 # rigsim did not start: $(tail -1 "$D/sim.log")"; exit 1; }; sleep .1; done
+start_cameras
 "$BOARDSIM" --config "$D/rigd.conf" --wires "$D/t" "$BIN/rigd" --config "$D/rigd.conf" >"$D/rigd.log" 2>&1 &
-board=$!
-within() { # tenths of a second, command...
-    i=$1
-    shift
-    while [ "$i" -gt 0 ]; do
-        "$@" && return 0
-        sleep .1
-        i=$((i - 1))
-    done
-    return 1
-}
+rigd=$! # in the end, boardsim is what has to end
 status() { "$BIN/rigctl" --json status >"$D/status" 2>/dev/null && grep -q "$1" "$D/status"; }
 idle() { status "\"n_ready\":$CAMERAS," && grep -q '"busy":false' "$D/status" && grep -q '"trigger":"usb"' "$D/status"; }
-ready() { within 300 idle || { cat "$D/status"; return 1; }; }
+board_ready() { ready && within 300 idle || { cat "$D/status"; return 1; }; }
 verified() { [ "$(cat "$D"/takes/*/take.json 2>/dev/null | grep -c '"state":"verified"')" = "$1" ]; }
 press() { # and the take that follows: the how-manieth
-    kill -USR1 $board
+    kill -USR1 $rigd
     within 150 verified "$1"
 }
 spread_us() { # of the latest take
     "$BIN/rigctl" --json report "$(ls "$D/takes" | tail -1)" | tr ',{}' '\n\n\n' | sed -n 's/.*"spread_ms":\([0-9.]*\).*/\1/p' | awk '{ print int(1000 * $1) }'
 }
-check "rigd finds the board and the cameras" ready
+must "rigd finds the board and the cameras" board_ready
 check "a press of the button becomes a verified take" press 1
 check "it has a frame of each camera" sh -c "[ \$(ls $D/takes/*/raw | wc -l) = $CAMERAS ]"
 check "the take says how far apart the shutters opened" sh -c "$BIN/rigctl report \$(ls $D/takes) | grep 'shutters: spread'"
 before=$(spread_us)
 check "lag is measured through the board's inputs" "$BIN/rigctl" calibrate lag --shots 4
-check "ready again" ready
+check "ready again" board_ready
 check "asked which board it is, it takes the order" "$BIN/rigctl" identify board
 check "a second press becomes a take with the lags made up for" press 2
 after=$(spread_us)
@@ -93,12 +54,12 @@ echo "# spread ${before:-?} us before calibration, ${after:-?} us after"
 # What the board adds: half of what it needs between edges, some 200 us, and a sample of its inputs, 125 us; the bodies .05 ms each.
 check "then the shutters open together" test "${after:-99999}" -lt 600 -a "${before:-0}" -gt 5000
 check "no command, edge or stamp was out of order" sh -c "! grep -E 'error|warning: (trigger|boardsim)' $D/rigd.log"
-kill -USR2 $board
+kill -USR2 $rigd
 check "the cable falls out: rigd says that the trigger is gone" within 30 status '"trigger":"\(broken\|not there\)"'
-check "plugged in again it is found again" ready
+check "plugged in again it is found again" board_ready
 check "and the button works again" press 3
-ended() { ! kill -0 $board 2>/dev/null || [ "$(cut -d' ' -f3 /proc/$board/stat)" = Z ]; }
-kill $board
+ended() { ! is_running $rigd; }
+kill $rigd
 check "rigd ends when asked to" within 30 ended
 echo "1..$n"
 exit $failed

@@ -244,6 +244,68 @@ static void nothing_outlives_the_daemon(void **state)
     }
 }
 
+static pid_t parent_of(int pid)
+{
+    char path[40], text[400] = "";
+    int parent = 0;
+    snprintf(path, sizeof(path), "/proc/%d/stat", pid);
+    FILE *f = fopen(path, "r");
+    if (f && fgets(text, sizeof(text), f) && strrchr(text, ')'))
+        sscanf(strrchr(text, ')') + 1, " %*c %d", &parent);
+    if (f)
+        fclose(f);
+    return parent;
+}
+
+// What a new daemon waits for before it touches anything.
+static void a_shared_lock_is_held_as_long_as_the_work_of_a_killed_daemon(void **state)
+{
+    (void)state;
+    const pid_t daemon = fork();
+    if (daemon == 0) {
+        struct executor *e = open_executor();
+        executor_lock(e, open(scratch_path("lock"), O_RDWR | O_CREAT | O_CLOEXEC, 0600));
+        start_shell(e, "setsid sleep 1000 & echo $! >child; echo $$ >pid; exec sleep 1000", false, ""); // a child that gets away does not count
+        for (;;)
+            pause();
+    }
+    const int pid = number_in("pid"), child = number_in("child"), lock = open(scratch_path("lock"), O_RDWR | O_CLOEXEC);
+    const pid_t keeper = parent_of(pid);
+    assert_true(keeper > 1 && keeper != daemon);
+    kill(keeper, SIGSTOP); // as good as a machine that is too busy
+    assert_true(becomes(keeper, "T"));
+    kill(daemon, SIGKILL);
+    waitpid(daemon, NULL, 0);
+    assert_int_equal(executor_lock_file(lock, true), -EAGAIN);
+    kill(keeper, SIGCONT);
+    assert_true(becomes(keeper, "X"));
+    int err = -EAGAIN;
+    for (int turn = 0; turn < 1000 && err; turn++) {
+        err = executor_lock_file(lock, true);
+        assert_true(err || strchr("ZX", state_of(pid) ? state_of(pid) : 'X'));
+        nanosleep(&(struct timespec){ 0, 10000000 }, NULL);
+    }
+    assert_int_equal(err, 0);
+    kill(child, SIGKILL);
+    close(lock);
+    unlink(scratch_path("pid")), unlink(scratch_path("child")), unlink(scratch_path("lock"));
+}
+
+static void a_keeper_that_is_killed_leaves_nothing_behind(void **state)
+{
+    (void)state;
+    struct executor *e = open_executor();
+    assert_true(start_shell(e, "sleep 1000 & echo $! >child; echo $$ >pid; wait", false, "") >= 0);
+    const int pid = number_in("pid"), child = number_in("child");
+    kill(parent_of(pid), SIGKILL);
+    assert_true(wait_for(e, &seen.n_ended, 1));
+    assert_true(seen.signalled && seen.code == SIGKILL);
+    assert_true(becomes(pid, "X"));
+    assert_true(becomes(child, "X"));
+    executor_close(e);
+    unlink(scratch_path("pid")), unlink(scratch_path("child"));
+}
+
 static void programs_see_only_what_is_theirs_and_stand_back(void **state)
 {
     (void)state;
@@ -284,6 +346,8 @@ int main(void)
         cmocka_unit_test(paused_is_stopped_and_a_stopped_one_still_ends),
         cmocka_unit_test(one_that_does_not_listen_is_killed_with_its_children),
         cmocka_unit_test(nothing_outlives_the_daemon),
+        cmocka_unit_test(a_shared_lock_is_held_as_long_as_the_work_of_a_killed_daemon),
+        cmocka_unit_test(a_keeper_that_is_killed_leaves_nothing_behind),
         cmocka_unit_test(programs_see_only_what_is_theirs_and_stand_back),
     };
     return cmocka_run_group_tests(tests, set_up, tear_down);

@@ -3,29 +3,9 @@
 # merging, the hook and solving are stand-ins (below) that can be told to be slow, to refuse or to die. Prints TAP.
 # BIN: where the programs are. Takes that are made here by hand have ten-byte frames: nobody but the stand-ins reads them.
 set -u
-BIN=$(cd "${BIN:-build/bin}" && pwd)
 CAMERAS=3
-D=$(mktemp -d "${TMPDIR:-/tmp}/studiorig-test-XXXXXX") || exit 1
-n=0 failed=0 rigd='' sim=''
-export RIGD_SOCKET="$D/s" RIGD_TOOLS="$D/tools" FAKE="$D/fake"
-finish() {
-    [ -n "$rigd" ] && kill "$rigd" 2>/dev/null && wait "$rigd" 2>/dev/null
-    [ -n "$sim" ] && kill "$sim" 2>/dev/null && wait "$sim" 2>/dev/null
-    rm -rf "$D"
-}
-trap finish EXIT
-check() { # name, command...
-    n=$((n + 1)) name=$1
-    shift
-    if "$@" >"$D/out" 2>&1; then
-        echo "ok $n - $name"
-    else
-        failed=1
-        echo "not ok $n - $name"
-        tail -25 "$D/out" | sed 's/^/#   /'
-        tail -12 "$D/rigd.log" 2>/dev/null | sed 's/^/#   log: /'
-    fi
-}
+. tests/chain_setup.sh
+export RIGD_TOOLS="$D/tools" FAKE="$D/fake"
 
 # ---- stand-ins ----------------------------------------------------------------------------------------------------------------
 # Each writes its process number to $FAKE/pid.NAME, waits while $FAKE/slow.NAME exists, and does what $FAKE/do.NAME says, if it is there.
@@ -87,16 +67,10 @@ echo iVBORw0KGgoAAAANSUhEUgAAAAEAAAABCAQAAAC1HAwCAAAAC0lEQVR42mNk+A8AAQUBAScY42Y
 chmod +x "$D"/tools/*
 ln -s "$BIN/rigd-contact" "$D/tools/rigd-contact"
 
-port=$((10000 + $$ % 1100 * 20))
-cat >"$D/rigd.conf" <<E1
-[rig]
-takes = $D/takes
-state = $D/state
-socket = $D/s
-personality_dir = $PWD/config/cameras
-raw_mb = 2
-free_space_mb = 1
-collect_timeout_ms = 3000
+rigsim="$rigsim --cameras $CAMERAS --seed 1"
+{
+    rig_section
+    cat <<E1
 [develop]
 demosaic = half
 jobs = 2
@@ -107,27 +81,12 @@ preview = on
 then = standard
 threads = 1
 E1
-simulate="$BIN/rigsim --cameras $CAMERAS --personality nikon --port $port --seed 1 --raw-size 408x272 --trigger-socket $D/t"
-$simulate --list >>"$D/rigd.conf"
-$simulate >"$D/sim.log" 2>&1 &
-sim=$!
-while [ ! -S "$D/t" ]; do kill -0 $sim || { echo "1..0 # rigsim did not start: $(tail -1 "$D/sim.log")"; exit 1; }; sleep .1; done
+    $rigsim --list
+} >"$D/rigd.conf"
+start_cameras
 
-start() {
-    "$BIN/rigd" --config "$D/rigd.conf" >>"$D/rigd.log" 2>&1 &
-    rigd=$!
-    i=0
-    until "$BIN/rigctl" --json status 2>/dev/null | grep -q "\"n_ready\":$CAMERAS,"; do
-        i=$((i + 1))
-        [ $i -lt 300 ] || return 1
-        sleep .1
-    done
-}
-restart_hard() { # as a power cut, for processes
-    kill -9 "$rigd"
-    wait "$rigd" 2>/dev/null
-    start
-}
+start_ready() { start && ready; }
+restart_hard() { start_again && ready; }
 # A finished take without cameras' help. id kind
 make_take() {
     mkdir -p "$D/takes/$1/raw" "$D/takes/$1/linear" "$D/takes/$1/geometry/cameras" "$D/takes/$1/thumbnails"
@@ -156,15 +115,8 @@ settled() { # take: within half a minute
 state_is() { grep -q "\"state\":\"$2\",\"id\"" "$D/takes/$1/take.json" || { cat "$D/takes/$1/take.json"; return 1; }; }
 says() { grep -q "$2" "$D/takes/$1/take.json" || { cat "$D/takes/$1/take.json"; return 1; }; }
 calls() { grep -c "^$1 .*$2" "$D/fake/calls"; } # how often was that started (for that)?
-await() { # command...: within half a minute
-    i=0
-    until "$@" >/dev/null 2>&1; do
-        i=$((i + 1))
-        [ $i -lt 300 ] || { echo "never: $*"; return 1; }
-        sleep .1
-    done
-}
-gone() { s=$(cut -d' ' -f3 "/proc/$1/stat" 2>/dev/null); [ -z "$s" ] || [ "$s" = Z ]; } # nobody here may reap orphans
+await() { within 300 "$@"; }
+gone() { ! is_running "$1"; }
 leftovers() { # nothing half under a final name, nothing hidden left in a settled take
     find "$D/takes" -name '*.part' | grep . && return 1
     find "$D/takes" -name half | grep . && return 1
@@ -174,7 +126,7 @@ leftovers() { # nothing half under a final name, nothing hidden left in a settle
 
 # ---- stories ------------------------------------------------------------------------------------------------------------------
 make_take 20260101T000000000_light panorama
-check "rigd starts and takes up what is owed" start
+must "rigd starts and takes up what is owed" start_ready
 check "a panorama take is merged" settled 20260101T000000000_light
 check "and is developed, with what is doubtful said" says 20260101T000000000_light 'not to be trusted: s01: the lamp clips'
 check "a take from the button to verified" "$BIN/rigctl" capture --name first
@@ -224,7 +176,7 @@ for what in develop hook preview standard; do
     check "$what: kill -9 of rigd ends it too" await gone "$pid"
     if [ $what = hook ]; then check "hook: and its children" await gone "$grandchild"; fi
     rm -f "$D/fake/pid.$what"
-    start || break
+    start_ready || break
     check "$what: begun again by the next rigd" await test -s "$D/fake/pid.$what"
     kill -9 "$(cat "$D/fake/pid.$what")"
     rm -f "$D/fake/slow.$what"

@@ -443,8 +443,10 @@ static void a_take_is_resumed_from_its_ledger(void **state)
             w.camera[4].fault.dead = true, w.camera[4].open = false;
         rig_free(w.rig);
         w.n_heap = 0;
-        for (int i = 0; i < 8; i++)
+        for (int i = 0; i < 8; i++) {
             w.camera[i].worker = false;
+            w.camera[i].n_thumbnails = 0;
+        }
         assert_int_equal(rig_create(&w.rig, &w.config), 0);
         rig_start(w.rig, w.now);
         if (story == 1) {
@@ -458,6 +460,8 @@ static void a_take_is_resumed_from_its_ledger(void **state)
         drain_actions();
         const struct ledger *l = rig_ledger(w.rig);
         assert_int_equal(l->state, story == 2 ? TAKE_FAILED : TAKE_VERIFIED);
+        for (int i = 0; i < 8; i++) // of those whose frames are still to come: the contact sheet shows them
+            assert_int_equal(w.camera[i].n_thumbnails, i == 4 && story != 2);
         if (story == 1)
             assert_int_equal(l->camera[4].n_objects, 1);
         else

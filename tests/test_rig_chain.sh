@@ -2,62 +2,19 @@
 # tests/test_rig_chain.sh - the whole rig as a user runs it: rigsim's cameras and wires, rigd with its workers, rigctl. Prints TAP.
 # BIN: where the programs are. KILLS=n: how many times daemon or a worker is killed at a random moment (default 6; 1000 for the long run).
 set -u
-BIN=${BIN:-build/bin} KILLS=${KILLS:-6} CAMERAS=${CAMERAS:-5} SEED=${SEED:-1}
-D=$(mktemp -d "${TMPDIR:-/tmp}/studiorig-test-XXXXXX") || exit 1
-n=0 failed=0 rigd='' sim=''
-export RIGD_SOCKET="$D/s"
-finish() {
-    [ -n "$rigd" ] && kill "$rigd" 2>/dev/null && wait "$rigd" 2>/dev/null
-    [ -n "$sim" ] && kill "$sim" 2>/dev/null && wait "$sim" 2>/dev/null
-    rm -rf "$D"
-}
-trap finish EXIT
-check() { # name, command...
-    n=$((n + 1)) name=$1
-    shift
-    if "$@" >"$D/out" 2>&1; then
-        echo "ok $n - $name"
-    else
-        failed=1
-        echo "not ok $n - $name"
-        sed 's/^/#   /' "$D/out" | tail -20
-        tail -10 "$D/rigd.log" 2>/dev/null | sed 's/^/#   /'
-    fi
-}
-port=$((10000 + $$ % 1100 * 20))
-cat >"$D/rigd.conf" <<E
-[rig]
-takes = $D/takes
-state = $D/state
-socket = $D/s
-personality_dir = $PWD/config/cameras
-raw_mb = 2
-free_space_mb = 1
-collect_timeout_ms = 3000
+KILLS=${KILLS:-6} CAMERAS=${CAMERAS:-5} SEED=${SEED:-1}
+. tests/chain_setup.sh
+rigsim="$rigsim --cameras $CAMERAS --seed $SEED"
+{
+    rig_section
+    cat <<E
 [settings]
 iso = 100
 shutter = 1/125
 E
-simulate="$BIN/rigsim --cameras $CAMERAS --personality nikon --port $port --seed $SEED --raw-size 408x272 --trigger-socket $D/t"
-$simulate --list >>"$D/rigd.conf"
-$simulate >"$D/sim.log" 2>&1 &
-sim=$!
-while [ ! -S "$D/t" ]; do kill -0 $sim || { echo "1..0 # rigsim did not start: $(tail -1 "$D/sim.log")"; exit 1; }; sleep .1; done
-start() {
-    "$BIN/rigd" --config "$D/rigd.conf" >>"$D/rigd.log" 2>&1 &
-    rigd=$!
-}
-ready() { # all cameras ready and nothing under way, within a minute
-    i=0
-    while [ $i -lt 600 ]; do
-        "$BIN/rigctl" --json status >"$D/status" 2>/dev/null && grep -q "\"n_ready\":$CAMERAS," "$D/status" && grep -q '"busy":false' "$D/status" &&
-            ! "$BIN/rigctl" takes 2>/dev/null | grep -qE ' (armed|exposing|collecting) ' && return 0
-        sleep .1
-        i=$((i + 1))
-    done
-    cat "$D/status"
-    return 1
-}
+    $rigsim --list
+} >"$D/rigd.conf"
+start_cameras
 # Every frame of every take here once: as many files as cameras, each unlike every other, none half; the manifest agrees.
 accounts() {
     bad=0
@@ -80,7 +37,7 @@ accounts() {
     return $bad
 }
 start
-check "all cameras open" ready
+must "all cameras open" ready
 check "preflight finds them fit" "$BIN/rigctl" preflight
 check "a take from request to verified" "$BIN/rigctl" capture --name first
 check "it says how far apart the shutters opened" sh -c "$BIN/rigctl report \$(ls $D/takes) | grep 'shutters: spread'"
@@ -111,7 +68,9 @@ while [ $k -lt "$KILLS" ]; do
 done
 check "$KILLS kills of daemon or worker: it is ready again" test $k = "$KILLS"
 check "no frame is lost, doubled or half there" accounts
-check "it ends when asked to" sh -c "kill $rigd; for i in 1 2 3 4 5 6 7 8 9 10 11 12 13 14 15 16 17 18 19 20 21 22 23 24 25 26 27 28 29 30; do kill -0 $rigd 2>/dev/null || exit 0; sleep .1; done; [ \"\$(cut -d' ' -f3 /proc/$rigd/stat)\" = Z ]"
+gone() { ! is_running "$rigd"; }
+kill "$rigd"
+check "it ends when asked to" within 30 gone
 check "no worker is left" sh -c "! pgrep -f '^rigd-camera A0[1-$CAMERAS]\$' -P 1"
 echo "1..$n"
 exit $failed

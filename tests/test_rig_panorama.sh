@@ -2,29 +2,8 @@
 # tests/test_rig_panorama.sh - a panorama as a user shoots it: rigsim's camera on its head before a studio's lights, rigd, rigctl, and what
 # goes wrong meanwhile. Prints TAP. BIN: where the programs are. KILLS=n: how many times the daemon is killed at a random moment.
 set -u
-BIN=${BIN:-build/bin} KILLS=${KILLS:-1} SEED=${SEED:-1}
-D=$(mktemp -d "${TMPDIR:-/tmp}/studiorig-test-XXXXXX") || exit 1
-n=0 failed=0 rigd='' sim=''
-export RIGD_SOCKET="$D/s"
-finish() {
-    [ -n "$rigd" ] && kill "$rigd" 2>/dev/null && wait "$rigd" 2>/dev/null
-    [ -n "$sim" ] && kill "$sim" 2>/dev/null && wait "$sim" 2>/dev/null
-    rm -rf "$D"
-}
-trap finish EXIT
-check() { # name, command...
-    n=$((n + 1)) name=$1
-    shift
-    if "$@" >"$D/out" 2>&1; then
-        echo "ok $n - $name"
-    else
-        failed=1
-        echo "not ok $n - $name"
-        sed 's/^/#   /' "$D/out" | tail -20
-        tail -10 "$D/rigd.log" 2>/dev/null | sed 's/^/#   /'
-    fi
-}
-port=$((10000 + $$ % 1100 * 20))
+KILLS=${KILLS:-1} SEED=${SEED:-1} CAMERAS=3
+. tests/chain_setup.sh
 # Lights for the camera: a synthetic studio's, so that nothing outside this folder is needed.
 "$BIN/rigsolve" synth D1 -o "$D/studio" --size 16x16 >"$D/out" 2>&1 || { echo "1..0 # rigsolve synth: $(tail -1 "$D/out")"; exit 1; }
 cat >"$D/faults" <<E
@@ -34,44 +13,18 @@ A03 on shot 7 dial 0x5007 560
 A03 on shot 2 head_stuck 1
 A03 on shot 8 drop
 E
-options="--cameras 3 --personality nikon --port $port --seed $SEED --raw-size 408x272 --trigger-socket $D/t --panorama $D/studio/panorama.exr"
-simulate() { # options
-    "$BIN/rigsim" $options "$@" >"$D/sim.log" 2>&1 &
-    sim=$!
-    while [ ! -S "$D/t" ]; do kill -0 $sim || { echo "1..0 # rigsim did not start: $(tail -1 "$D/sim.log")"; exit 1; }; sleep .1; done
-}
-cat >"$D/rigd.conf" <<E
-[rig]
-takes = $D/takes
-state = $D/state
-socket = $D/s
-personality_dir = $PWD/config/cameras
-raw_mb = 1
-free_space_mb = 1
-collect_timeout_ms = 3000
+rigsim="$rigsim --cameras $CAMERAS --seed $SEED --panorama $D/studio/panorama.exr"
+{
+    rig_section
+    cat <<E
 [settings]
 imageformat = raw
 iso = 100
 aperture = 8
 shutter = 1/125
 E
-"$BIN/rigsim" $options --list >>"$D/rigd.conf"
-sed -i 's/^\[panorama\]/&\nstops = 0,0; 45,0\nmeter = 1\/1000\nlongest = 1\/250\nsettle_ms = 100/' "$D/rigd.conf"
-start() {
-    "$BIN/rigd" --config "$D/rigd.conf" >>"$D/rigd.log" 2>&1 &
-    rigd=$!
-}
-ready() {
-    i=0
-    while [ $i -lt 900 ]; do
-        "$BIN/rigctl" --json status >"$D/status" 2>/dev/null && grep -q '"n_ready":3,' "$D/status" && grep -q '"busy":false' "$D/status" &&
-            ! "$BIN/rigctl" takes 2>/dev/null | grep -qE ' (armed|exposing|collecting) ' && return 0
-        sleep .1
-        i=$((i + 1))
-    done
-    cat "$D/status"
-    return 1
-}
+    $rigsim --list | sed 's/^\[panorama\]/&\nstops = 0,0; 45,0\nmeter = 1\/1000\nlongest = 1\/250\nsettle_ms = 100/'
+} >"$D/rigd.conf"
 newest() { ls -d "$D"/takes/*_"$1" | tail -1; }
 # Every exposure of a verified panorama is here once, none half, and its plan names them.
 accounts() {
@@ -89,9 +42,9 @@ accounts() {
     find "$D/takes" -path '*/raw/*' -type f -exec sha256sum {} + | cut -d' ' -f1 | sort | uniq -d | grep . && { echo "a frame is there twice"; bad=1; }
     return $bad
 }
-simulate
+start_cameras
 start
-check "all cameras open" ready
+must "all cameras open" ready
 check "a panorama from request to verified" sh -c "timeout 120 $BIN/rigctl panorama --name first 2>$D/steps"
 check "it says each step" sh -c "cat $D/steps; grep -q 'stop 2 of 2: to yaw 45' $D/steps && grep -q 'stop 1 of 2: exposure 1, 1/1000 s' $D/steps && grep -q 'stop 2 of 2 is done' $D/steps"
 check "its frames and its plan are here" accounts
@@ -103,9 +56,7 @@ while [ $k -lt "$KILLS" ]; do
     "$BIN/rigctl" panorama --name "kill$k" >/dev/null 2>&1 &
     ctl=$!
     sleep "$(awk -v s="$SEED" -v k="$k" 'BEGIN { srand(s * 100003 + k); printf "%.3f", 1.2 + rand() * 7 }')"
-    kill -9 "$rigd"
-    wait "$rigd" 2>/dev/null
-    start
+    start_again
     wait $ctl
     ready >/dev/null || break
     k=$((k + 1))
@@ -114,10 +65,9 @@ check "$KILLS kills: each panorama went on by itself" test $k = "$KILLS"
 check "no exposure is lost, doubled or half there" accounts
 kill "$sim" "$rigd"
 wait "$sim" "$rigd" 2>/dev/null
-rm -f "$D/t"
-simulate --faults "$D/faults"
+start_cameras --faults "$D/faults"
 start
-check "it opens them again" ready
+must "it opens them again" ready
 check "a closed shutter, a lost event, a turned dial, a stuck head, a broken link: it is whole" sh -c "timeout 150 $BIN/rigctl panorama --name faults 2>$D/steps"
 check "each is said" sh -c "cat $D/steps; grep -q 'exposed again' $D/steps && grep -q 'head did not reach' $D/steps && grep -q 'aperture' $D/steps"
 check "and every exposure is here" accounts

@@ -22,21 +22,19 @@ check() { # name, then a command that must succeed
     fi
 }
 
-port=0
-start() { # options; two cameras on the first free four ports
-    port=$((21000 + $$ % 4000 * 2))
-    for try in 1 2 3 4 5 6 7 8; do
-        "$BIN/rigsim" --cameras 2 --port $port --raw-size 640x480 "$@" 2>"$work/log" &
-        pid=$!
-        for wait in $(seq 100); do
-            grep -q 'cameras (' "$work/log" && return
-            kill -0 $pid 2>/dev/null || break
-            sleep .05
-        done
-        kill $pid 2>/dev/null
-        wait $pid 2>/dev/null
-        port=$((port + 500))
+address=127.$((1 + ($$ >> 16 & 127))).$(($$ >> 8 & 255)).$(($$ & 255)) # nobody else's on this machine (tests/loopback.h)
+start() { # options
+    "$BIN/rigsim" --cameras 2 --address $address --raw-size 640x480 "$@" 2>"$work/log" &
+    pid=$!
+    for wait in $(seq 400); do
+        grep -q 'cameras (' "$work/log" && return
+        kill -0 $pid 2>/dev/null || break
+        sleep .05
     done
+    echo "not ok $((n + 1)) - rigsim starts"
+    sed 's/^/#   /' "$work/log"
+    echo "1..$((n + 1))"
+    exit 1
 }
 stop() {
     kill $pid && wait $pid
@@ -44,7 +42,7 @@ stop() {
     pid=
     return $status
 }
-g() { (cd "$work/files" && HOME="$work/home" timeout 60 gphoto2 --port ptpip:127.0.0.1:$port:$((port + 1)) "$@" 2>&1); }
+g() { (cd "$work/files" && HOME="$work/home" timeout 60 gphoto2 --port ptpip:$address:15740:15741 "$@" 2>&1); }
 says() { # text, gphoto2's options
     text=$1
     shift
@@ -118,6 +116,8 @@ story nikon D500 f-number f/5.6 imagequality NEF+Fine /store_00020001/DCIM/100ND
 story canon 'Canon EOS 700D' aperture 5.6 imageformat 'RAW + Large Fine JPEG' /store_00020001/DCIM/100CANON 053070001001
 
 check "a wrong option is a usage error" sh -c "$BIN/rigsim --cameras 0 2>&1; [ \$? = 2 ]"
+check "another address is listed" sh -c "$BIN/rigsim --address 127.3.2.1 --list | grep -qx 'port = ptpip:127.3.2.1:15740:15741'"
+check "one that others could reach is refused" sh -c "$BIN/rigsim --address 0.0.0.0 2>&1 | grep -q \"found '0.0.0.0'; expected 127.x.y.z\""
 check "--list is a section per camera" sh -c "$BIN/rigsim --cameras 23 --list | grep -c '^\[camera \"[AB][0-9][0-9]\"\]' | grep -qx 23"
 check "a wrong personality names file and line" sh -c "printf 'base = nikon\nwhat = 1\n' >$work/p; $BIN/rigsim --personality $work/p 2>&1 | grep -q \"$work/p:2: found 'what'\""
 echo "1..$n"

@@ -60,12 +60,13 @@ sub end {
     delete $children{$pid};
 }
 
-my $next_port = 20000 + $$ % 250 * 48; # below those that the kernel gives to clients
+# An address of this machine that is nobody else's (tests/loopback.h).
+sub address { sprintf '127.%d.%d.%d', 1 + ($$ >> 16 & 127), $$ >> 8 & 255, $$ & 255 }
 
 # cameras, personality, raw (WxH), set [...], faults (text), rig (lines of [rig]), trigger (lines), takes (folder), sections (sub: edits the list)
 sub new_rig {
     my (%o) = @_;
-    my $r = { %o, dir => $o{dir} // folder($o{ram}), port => $o{port} // $next_port };
+    my $r = { %o, dir => $o{dir} // folder($o{ram}), port => $o{port} // 15740 };
     my $d = $r->{dir};
     $r->{takes} //= "$d/takes";
     $r->{personality} //= 'nikon';
@@ -74,7 +75,7 @@ sub new_rig {
         open(my $f, '>', "$d/faults") or die;
         print $f $faults;
     }
-    my @sim = ("$BIN/rigsim", '--cameras', $o{cameras}, '--personality', $r->{personality}, '--port', $r->{port}, '--seed', $o{seed} // $SEED, '--raw-size', $o{raw} // '408x272',
+    my @sim = ("$BIN/rigsim", '--cameras', $o{cameras}, '--personality', $r->{personality}, '--address', address(), '--port', $r->{port}, '--seed', $o{seed} // $SEED, '--raw-size', $o{raw} // '408x272',
         '--trigger-socket', "$d/wires", (map { ('--set', $_) } @{$o{set} // []}), defined $faults ? ('--faults', "$d/faults") : ());
     my $list = do { open(my $p, '-|', @sim, '--list') or die; local $/; <$p> };
     $list =~ s/^address = .*\n/$&$o{trigger}\n/m if $o{trigger};
@@ -184,7 +185,7 @@ sub kill_instance {
     my ($instance, $n, $result) = @_;
     my $cameras = $ENV{CAMERAS} // 6;
     srand($SEED * 1000 + $instance);
-    my $r = new_rig(ram => 1, cameras => $cameras, port => $next_port + 100 * $instance, seed => $SEED + $instance, trigger => "half_press_ms = 60\nhold_ms = 100",
+    my $r = new_rig(ram => 1, cameras => $cameras, seed => $SEED + $instance, trigger => "half_press_ms = 60\nhold_ms = 100",
         rig => "raw_mb = 1\nfree_space_mb = 1\ncollect_timeout_ms = 3000\n");
     my (%where, $phase, $capturing, $fresh, $resumes, %own);
     $r->{ends_with_daemon} = 1;
@@ -313,7 +314,7 @@ sub audit {
             }
         }
     }
-    chomp(my @parts = `find $r->{takes} -name '*.part*' -o -name '.*' -type f`);
+    chomp(my @parts = `find $r->{takes} -name '*.part*' -o -name '.*' -type f ! -name .processing.lock`);
     $complain->("left over: $_") for @parts;
     # The cards, by the stock client.
     end(delete $r->{rigd});
@@ -324,7 +325,7 @@ sub audit {
         system('mkdir', '-p', $out);
         local $ENV{HOME} = $out;
         my $p = $r->{port} + 2 * $i;
-        system("cd $out && gphoto2 --quiet --port ptpip:127.0.0.1:$p:" . ($p + 1) . " --get-all-files --force-overwrite --filename '%f.%C' >$r->{dir}/gphoto.log 2>&1");
+        system("cd $out && gphoto2 --quiet --port ptpip:" . address() . ":$p:" . ($p + 1) . " --get-all-files --force-overwrite --filename '%f.%C' >$r->{dir}/gphoto.log 2>&1");
         for my $path (glob "$out/*.*") {
             my ($stem) = $path =~ m{([^/]+)\.[^.]+$};
             $on_cards++;

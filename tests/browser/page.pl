@@ -36,6 +36,7 @@ ok $page->until_true('document.querySelectorAll("#takes li[data-take]").length =
 like $text->('#takes li'), qr/verified: 6 of 6 cameras, 6 frames, \d+\.\d MB/, '... with its state and figures';
 ok $page->until_true('[...document.querySelectorAll("#cameras img")].filter(i => !i.hidden && i.naturalWidth > 0).length === 6'), 'each camera shows its frame';
 
+ok $page->until_true('!document.querySelector("#capture").disabled'), 'the button is armed again'; # Enter does what the button does: nothing before
 $page->js('document.querySelector("#name").focus()');
 $page->call('Input.insertText', { text => 'vase' });
 $page->key('Enter', 13);
