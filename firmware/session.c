@@ -452,7 +452,7 @@ void session_run(void)
     if (e.link_lost) {
         e.link_lost = false;
         end_session();
-        e.reader.n = 0;
+        e.reader.n = e.reader.n_given = 0;
     }
     if (e.open && (uint16_t)(ms - e.heard_ms) >= e.silence_ms) {
         end_session();
@@ -461,9 +461,14 @@ void session_run(void)
     }
     frame_idle(&e.reader, ms);
     uint8_t byte;
-    for (uint8_t i = 0; i < BYTES_PER_RUN && board_can_send() && board_receive(&byte); i++)
-        if (frame_push(&e.reader, byte, ms))
+    for (uint8_t i = 0; i < BYTES_PER_RUN && board_can_send(); i++) {
+        if (frame_next(&e.reader, ms))
             answer(e.reader.byte);
+        else if (board_receive(&byte))
+            frame_push(&e.reader, byte, ms);
+        else
+            break;
+    }
     if (!board_can_send())
         return;
     uint8_t event[PROTO_FRAME_MAX], n;

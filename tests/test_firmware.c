@@ -148,6 +148,15 @@ static uint8_t make_frame(uint8_t *f, uint8_t n)
     return proto_seal(f, (uint8_t)any(256), (uint8_t)any(256), n);
 }
 
+// True: the byte made a frame whole.
+static bool push(struct frame_reader *r, uint8_t byte, uint16_t now_ms)
+{
+    while (frame_next(r, now_ms))
+        ;
+    frame_push(r, byte, now_ms);
+    return frame_next(r, now_ms);
+}
+
 static void a_frame_is_found_in_any_junk_that_does_not_hide_it(void **state)
 {
     (void)state;
@@ -157,11 +166,11 @@ static void a_frame_is_found_in_any_junk_that_does_not_hide_it(void **state)
         uint8_t f[PROTO_FRAME_MAX];
         const uint8_t n = make_frame(f, (uint8_t)any(PROTO_PAYLOAD_MAX + 1));
         for (uint32_t junk = any(40); junk > 0; junk--)
-            assert_false(frame_push(&r, junk == 2 ? PROTO_SYNC_0 : junk == 1 ? PROTO_SYNC_1 : (uint8_t)any(PROTO_SYNC_0), 0));
+            assert_false(push(&r, junk == 2 ? PROTO_SYNC_0 : junk == 1 ? PROTO_SYNC_1 : (uint8_t)any(PROTO_SYNC_0), 0));
         // The junk may look like the begin of a frame: then the real one is found when that has failed, at the latest with 61 bytes more.
         bool found = false;
         for (uint8_t i = 0; i < n + 61 && !found; i++)
-            found = frame_push(&r, i < n ? f[i] : 0, 0);
+            found = push(&r, i < n ? f[i] : 0, 0);
         assert_true(found);
         assert_memory_equal(r.byte, f, n);
     }
@@ -178,7 +187,7 @@ static void a_frame_with_any_bit_wrong_is_no_frame(void **state)
             struct frame_reader r = { 0 };
             f[bit / 8] ^= (uint8_t)(1 << bit % 8);
             for (uint8_t i = 0; i < n; i++)
-                assert_false(frame_push(&r, f[i], 0));
+                assert_false(push(&r, f[i], 0));
             f[bit / 8] ^= (uint8_t)(1 << bit % 8);
         }
     }
@@ -191,15 +200,65 @@ static void a_frame_that_does_not_end_is_given_up(void **state)
     uint8_t f[PROTO_FRAME_MAX];
     const uint8_t n = make_frame(f, 20);
     for (uint8_t i = 0; i < n - 1; i++)
-        frame_push(&r, f[i], 65500);
+        push(&r, f[i], 65500);
     frame_idle(&r, (uint16_t)(65500 + PROTO_FRAME_GAP_MS - 1));
     assert_int_equal(r.n, n - 1);
     frame_idle(&r, (uint16_t)(65500 + PROTO_FRAME_GAP_MS)); // the clock wrapped
     assert_int_equal(r.n, 0);
     assert_int_equal(r.n_bad, 1);
-    assert_false(frame_push(&r, f[n - 1], 0));
+    assert_false(push(&r, f[n - 1], 0));
     for (uint8_t i = 0; i < n; i++)
-        assert_int_equal(frame_push(&r, f[i], 1), i == n - 1);
+        assert_int_equal(push(&r, f[i], 1), i == n - 1);
+}
+
+// What begins like a long frame and is none may hold several short ones: each is given out once, in order, and none is written past the end.
+static void frames_hidden_in_a_broken_one_are_given_out_once_each(void **state)
+{
+    (void)state;
+    seed = 3;
+    for (int round = 0; round < 2000; round++) {
+        struct frame_reader r = { 0 };
+        uint8_t bytes[400], sent[12];
+        int n = 0, n_sent = 0, n_found = 0;
+        for (int burst = 0; burst < 3; burst++) {
+            const uint8_t begin[3] = { PROTO_SYNC_0, PROTO_SYNC_1, (uint8_t)any(PROTO_PAYLOAD_MAX + 1) };
+            memcpy(bytes + n, begin, sizeof(begin));
+            n += sizeof(begin);
+            for (uint32_t k = 1 + any(4); k > 0; k--) {
+                uint8_t f[PROTO_FRAME_MAX];
+                const uint8_t n_frame = make_frame(f, (uint8_t)any(12));
+                memcpy(bytes + n, f, n_frame);
+                n += n_frame, sent[n_sent++] = f[3];
+            }
+        }
+        memset(bytes + n, 0, PROTO_FRAME_MAX);
+        n += PROTO_FRAME_MAX;
+        for (int i = 0; i < n; i++) {
+            frame_push(&r, bytes[i], 0);
+            while (frame_next(&r, 0)) {
+                assert_true(n_found < n_sent && r.byte[3] == sent[n_found]);
+                n_found++;
+            }
+            assert_true(r.n < PROTO_FRAME_MAX);
+        }
+        assert_int_equal(n_found, n_sent);
+    }
+}
+
+// A host that died amid a frame leaves its begin; the next one's HELLO comes at once and must not be lost with it.
+static void a_hello_behind_half_a_frame_is_answered(void **state)
+{
+    (void)state;
+    start_at(0);
+    board_sim_write((const uint8_t[]){ PROTO_SYNC_0, PROTO_SYNC_1, PROTO_PAYLOAD_MAX, 1, PROTO_SHOT_TOGETHER, 7 }, 6);
+    board_sim_run(MS);
+    uint8_t hello[PROTO_FRAME_MAX], packet[PROTO_PACKET_BYTES];
+    proto_put_u16(hello + PROTO_HEADER_BYTES, PROTO_VERSION);
+    board_sim_write(hello, proto_seal(hello, PROTO_HELLO, 9, 2));
+    board_sim_run((PROTO_FRAME_GAP_MS + 20) * MS);
+    assert_int_equal(board_sim_read(packet), PROTO_HEADER_BYTES + 1 + PROTO_CAPABILITIES_BYTES + PROTO_CRC_BYTES);
+    assert_int_equal(packet[4], PROTO_HELLO | PROTO_REPLY);
+    assert_int_equal(packet[PROTO_HEADER_BYTES], PROTO_OK);
 }
 
 // ---- sessions -------------------------------------------------------------------------------------------------------------------------
@@ -1223,6 +1282,8 @@ int main(void)
         cmocka_unit_test(a_frame_is_found_in_any_junk_that_does_not_hide_it),
         cmocka_unit_test(a_frame_with_any_bit_wrong_is_no_frame),
         cmocka_unit_test(a_frame_that_does_not_end_is_given_up),
+        cmocka_unit_test(frames_hidden_in_a_broken_one_are_given_out_once_each),
+        cmocka_unit_test(a_hello_behind_half_a_frame_is_answered),
         cmocka_unit_test(nothing_is_done_without_a_session_or_out_of_sequence),
         cmocka_unit_test(a_command_of_the_wrong_length_or_value_changes_nothing),
         cmocka_unit_test(capabilities_and_status_say_what_is),
