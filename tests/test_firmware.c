@@ -661,6 +661,33 @@ static void a_late_board_says_how_late_and_gives_up_what_is_too_late(void **stat
 }
 
 // ---- nothing stays on -----------------------------------------------------------------------------------------------------------------
+// The guard looks at each register every 64 ms: what went off and on again between two looks has not been on all the time.
+static void what_is_pressed_again_at_once_is_granted_its_whole_time_again(void **state)
+{
+    (void)state;
+    start();
+    struct frames_shot s = plain_shot(200);
+    struct frames_event e;
+    s.lead = 0, s.hold = 1200 * MS;
+    for (int round = 0; round < 4; round++) {
+        assert_int_equal(frames_load(&host, &s), PROTO_OK);
+        assert_int_equal(frames_commit(&host, &s, frames_now(&host) + 10 * MS), PROTO_OK);
+        assert_true(frames_listen(&host, 1500 * MS, PROTO_FIRED, &e));
+        assert_int_equal(e.payload[2], PROTO_FIRED_DONE);
+        for (int i = 0; i < 200; i++)
+            assert_true(seen.off[i] - seen.on[i] >= s.hold);
+    }
+    const uint8_t on[3] = { 144, 1, 1 }, off[3] = { 144, 1, 0 }; // output 400, 5000 ms
+    for (int round = 0; round < 4; round++) {
+        assert_int_equal(frames_command(&host, PROTO_OUTPUT, on, 3, NULL), PROTO_OK);
+        frames_run(&host, 4000 * MS);
+        assert_true(is_on(400));
+        assert_int_equal(frames_command(&host, PROTO_OUTPUT, off, 3, NULL), PROTO_OK);
+        frames_run(&host, MS); // off indeed
+    }
+    check_on_times();
+}
+
 static void an_output_left_on_goes_off_by_itself_in_time(void **state)
 {
     (void)state;
@@ -1293,6 +1320,7 @@ int main(void)
         cmocka_unit_test(a_shot_that_cannot_be_done_is_refused_as_a_whole),
         cmocka_unit_test(a_release_in_the_middle_lets_go_at_once_and_says_so),
         cmocka_unit_test(a_late_board_says_how_late_and_gives_up_what_is_too_late),
+        cmocka_unit_test(what_is_pressed_again_at_once_is_granted_its_whole_time_again),
         cmocka_unit_test(an_output_left_on_goes_off_by_itself_in_time),
         cmocka_unit_test(a_silent_host_leaves_nothing_on_in_any_state),
         cmocka_unit_test(a_host_that_does_not_read_is_silent_too),
