@@ -1,6 +1,7 @@
 // tests/test_firmware.c - the trigger board's logic on the host: every edge on its tick, nothing on for too long, whatever the host does.
 #include "firmware/board_sim.h"
 #include "firmware/frame.h"
+#include "firmware/usb.h"
 #include "tests/board/frames.h"
 
 #include <math.h>
@@ -259,6 +260,25 @@ static void a_hello_behind_half_a_frame_is_answered(void **state)
     assert_int_equal(board_sim_read(packet), PROTO_HEADER_BYTES + 1 + PROTO_CAPABILITIES_BYTES + PROTO_CRC_BYTES);
     assert_int_equal(packet[4], PROTO_HELLO | PROTO_REPLY);
     assert_int_equal(packet[PROTO_HEADER_BYTES], PROTO_OK);
+}
+
+// ---- USB ------------------------------------------------------------------------------------------------------------------------------
+static void endpoints_that_there_are_not_are_stalled(void **state)
+{
+    (void)state;
+    start_at(0);
+    usb_reset();
+    uint8_t clear_halt[8] = { 2, 1, 0, 0, PROTO_ENDPOINT_IN, 0, 0, 0 };
+    const uint8_t set_interface[8] = { 1, 11, 0, 0, 0, 0, 0, 0 }, set_configuration[8] = { 0, 9, 1, 0, 0, 0, 0, 0 };
+    assert_int_equal(usb_setup(clear_halt, 0), USB_STALL); // not configured: there is none yet
+    assert_int_equal(usb_setup(set_interface, 0), USB_STALL);
+    assert_int_equal(usb_setup(set_configuration, 0), USB_CONFIGURED);
+    assert_int_equal(usb_setup(set_interface, 0), USB_CONFIGURED);
+    for (int endpoint = 0; endpoint < 256; endpoint++) {
+        clear_halt[4] = (uint8_t)endpoint;
+        const bool is_ours = endpoint == PROTO_ENDPOINT_OUT || endpoint == PROTO_ENDPOINT_IN;
+        assert_int_equal(usb_setup(clear_halt, 0), is_ours ? USB_CLEAR_HALT : USB_STALL);
+    }
 }
 
 // ---- sessions -------------------------------------------------------------------------------------------------------------------------
@@ -1311,6 +1331,7 @@ int main(void)
         cmocka_unit_test(a_frame_that_does_not_end_is_given_up),
         cmocka_unit_test(frames_hidden_in_a_broken_one_are_given_out_once_each),
         cmocka_unit_test(a_hello_behind_half_a_frame_is_answered),
+        cmocka_unit_test(endpoints_that_there_are_not_are_stalled),
         cmocka_unit_test(nothing_is_done_without_a_session_or_out_of_sequence),
         cmocka_unit_test(a_command_of_the_wrong_length_or_value_changes_nothing),
         cmocka_unit_test(capabilities_and_status_say_what_is),
