@@ -340,6 +340,10 @@ static int do_stop(struct job *j, struct stitch *stitch, const struct panorama_s
     json_set_number(to, "roll_deg", stop->roll_deg);
     lens_head(R, stop->yaw_deg * M_PI / 180, stop->pitch_deg * M_PI / 180, stop->roll_deg * M_PI / 180);
     const int n = look_at_files(j, stop, shot);
+    const char *slash = strrchr(j->output, '/');
+    char folder[PANORAMA_FILE_MAX];
+    snprintf(folder, sizeof(folder), "%.*s", slash ? (int)(slash - j->output + 1) : 1, slash ? j->output : ".");
+    stitch_rest(stitch, folder);
     int err = n ? measure_noise(j, stop, shot, n) : 0;
     if (!err && n)
         err = merge_stop(j, &b, stop, shot, n, &facts);
@@ -366,7 +370,7 @@ static int do_stop(struct job *j, struct stitch *stitch, const struct panorama_s
     if (!err && merged.width == j->plan.lens.width_px && merged.height == j->plan.lens.height_px)
         merged_unshade(&merged, &j->plan.lens);
     if (!err)
-        err = stitch_add(stitch, &j->plan.lens, R, &merged, &seam);
+        err = stitch_add_last(stitch, &j->plan.lens, R, &merged, &seam);
     merged_free(&merged);
     if (err)
         return err;
