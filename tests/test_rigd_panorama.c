@@ -122,6 +122,7 @@ static int run_with(const struct mishap *m)
 }
 
 // How many findings of a kind (of a stop and file, as far as given).
+// NULL: any.
 static int found(const char *kind, const char *stop, const char *file)
 {
     int n = 0;
@@ -133,7 +134,7 @@ static int found(const char *kind, const char *stop, const char *file)
         json_get_string(v, "kind", &k);
         json_get_string(v, "stop", &s);
         json_get_string(v, "file", &f);
-        n += !strcmp(k, kind) && (!stop || !strcmp(s, stop)) && (!file || strstr(f, file));
+        n += (!kind || !strcmp(k, kind)) && (!stop || !strcmp(s, stop)) && (!file || strstr(f, file));
     }
     return n;
 }
@@ -286,6 +287,14 @@ static void missing_stops_and_frames_are_named(void **state)
     assert_int_equal(run_with(&none), 3);
     show("not a raw");
     assert_int_equal(found("unreadable_frame", "s0", "s0_3.dng"), 1);
+    shoot(0, 3, &none);
+    struct stat st; // its head is whole, its photosites are not: said once, and as what it is
+    assert_int_equal(stat(scratch_path("s0_3.dng"), &st), 0);
+    assert_int_equal(truncate(scratch_path("s0_3.dng"), st.st_size / 2), 0);
+    assert_int_equal(run_with(&none), 3);
+    show("half a raw");
+    assert_int_equal(found("unreadable_frame", "s0", "s0_3.dng"), 1);
+    assert_int_equal(found(NULL, "s0", "s0_3.dng"), 1);
     shoot(0, 3, &none);
 }
 
