@@ -549,13 +549,14 @@ bool board_can_send(void)
     return is_configured && (UEINTX & 1 << TXINI);
 }
 
+// Of an IN endpoint bit 2 of UEINTX is not RXOUTI but KILLBK: a 1 throws away the packet that was written last.
 void board_send(const uint8_t *frame, uint8_t n)
 {
     UENUM = IN;
     for (uint8_t i = 0; i < n; i++)
         UEDATX = frame[i];
-    UEINTX = (uint8_t)~(1 << TXINI);
-    UEINTX = (uint8_t)~(1 << FIFOCON);
+    UEINTX = (uint8_t)~(1 << TXINI | 1 << RXOUTI);
+    UEINTX = (uint8_t)~(1 << FIFOCON | 1 << RXOUTI);
 }
 
 uint8_t board_serial(uint8_t i)

@@ -102,29 +102,29 @@ void feedback_beat(bool odd)
     f.sampled = sequencer_sample(f.input, f.n_registers);
 }
 
-bool feedback_peek(struct feedback_closing *out)
+// A shot may begin at any time, and all that waits belong to it from then on.
+bool feedback_peek(struct feedback_closing *out, uint64_t *tick)
 {
     const uint8_t lock = board_lock();
     const bool has = f.n > 0;
     *out = f.closing[f.head];
+    *tick = f.first + (uint32_t)out->sample * FEEDBACK_TICKS;
     board_unlock(lock);
     return has;
 }
 
-uint64_t feedback_tick(uint16_t sample)
-{
-    return f.first + (uint32_t)sample * FEEDBACK_TICKS; // the main loop's: it changes only when a shot begins
-}
-
-void feedback_drop(void)
+bool feedback_take(uint64_t tick, struct feedback_closing *out)
 {
     const uint8_t lock = board_lock();
-    if (f.n > 0) {
+    *out = f.closing[f.head];
+    const bool has = f.n > 0 && f.first + (uint32_t)out->sample * FEEDBACK_TICKS == tick;
+    if (has) {
         f.n--;
         if (++f.head == CLOSINGS)
             f.head = 0;
     }
     board_unlock(lock);
+    return has;
 }
 
 uint16_t feedback_take_lost(void)

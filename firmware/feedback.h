@@ -18,9 +18,8 @@ struct feedback_closing {
 void feedback_configure(uint8_t n_registers, bool active_high, uint16_t after_ms);
 void feedback_start(void); // forget everything
 // Main loop. False: none.
-bool feedback_peek(struct feedback_closing *out);
-uint64_t feedback_tick(uint16_t sample);
-void feedback_drop(void); // the one peeked at
+bool feedback_peek(struct feedback_closing *out, uint64_t *tick);
+bool feedback_take(uint64_t tick, struct feedback_closing *out); // the next, if it is of that tick
 uint16_t feedback_take_lost(void);
 bool feedback_take_capture(uint64_t *at, uint16_t *n_lost);
 

@@ -27,47 +27,55 @@ static enum verdict judge(const struct frame_reader *r)
     return ~crc == proto_get_u32(r->byte + n_checked) ? WHOLE : WRONG;
 }
 
-// Forget the first byte, and all up to what may be a begin.
-static void skip(struct frame_reader *r)
+// Forget the first i bytes, and all up to what may be a begin.
+static void skip(struct frame_reader *r, uint8_t i)
 {
-    uint8_t i = 1;
     while (i < r->n && r->byte[i] != PROTO_SYNC_0)
         i++;
     r->n = (uint8_t)(r->n - i);
     memmove(r->byte, r->byte + i, r->n);
 }
 
-bool frame_push(struct frame_reader *r, uint8_t byte, uint16_t now_ms)
+bool frame_next(struct frame_reader *r, uint16_t now_ms)
 {
-    if (r->n >= PROTO_HEADER_BYTES + PROTO_CRC_BYTES && r->n == r->byte[2] + PROTO_HEADER_BYTES + PROTO_CRC_BYTES)
-        r->n = 0; // the frame that was given out last
-    if (r->n == 0) {
+    if (r->n_given > 0) {
+        skip(r, r->n_given);
+        r->n_given = 0;
         r->begun_ms = now_ms;
-        if (byte != PROTO_SYNC_0)
-            return false;
     }
-    r->byte[r->n++] = byte;
-    for (;;) {
+    while (r->n > 0) {
         switch (judge(r)) {
         case MORE:
             return false;
         case WHOLE:
+            r->n_given = (uint8_t)(r->byte[2] + PROTO_HEADER_BYTES + PROTO_CRC_BYTES);
             return true;
         case WRONG:
             if (r->n > 1) // a lone 0xA5 is nothing yet
                 r->n_bad++;
-            skip(r);
+            skip(r, 1);
             r->begun_ms = now_ms;
             break;
         }
     }
+    return false;
+}
+
+void frame_push(struct frame_reader *r, uint8_t byte, uint16_t now_ms)
+{
+    if (r->n == 0) {
+        r->begun_ms = now_ms;
+        if (byte != PROTO_SYNC_0)
+            return;
+    }
+    r->byte[r->n++] = byte;
 }
 
 void frame_idle(struct frame_reader *r, uint16_t now_ms)
 {
-    if (r->n == 0 || (uint16_t)(now_ms - r->begun_ms) < PROTO_FRAME_GAP_MS)
+    if (r->n == 0 || r->n_given > 0 || (uint16_t)(now_ms - r->begun_ms) < PROTO_FRAME_GAP_MS || judge(r) != MORE)
         return;
-    if (judge(r) == MORE)
-        r->n_bad++;
-    r->n = 0;
+    r->n_bad++;
+    skip(r, 1); // what began within it may be whole
+    r->begun_ms = now_ms;
 }

@@ -194,6 +194,19 @@ uint8_t sequencer_channels(uint8_t first_entry, const uint8_t *entries, uint8_t 
     return PROTO_OK;
 }
 
+// The guard counts from here, whatever it last saw: all of them are off; unless that is still on its way to the latches.
+static void start_ages(void)
+{
+    if (s.change != s.latched_change)
+        return;
+    for (uint16_t r = 0; r < s.n_registers; r++)
+        for (uint8_t b = 0; s.together[r] && b < 8; b++)
+            if (s.together[r] & bit_of[b])
+                s.age[r * 8 + b] = 0;
+    for (uint8_t i = 0; i < s.n; i++)
+        s.age[s.channel[i].output] = 0;
+}
+
 static bool is_any_on(void)
 {
     for (uint8_t r = 0; r < s.n_registers; r++)
@@ -226,6 +239,7 @@ uint8_t sequencer_commit(uint16_t shot, uint64_t when, uint16_t *wrong)
     }
     if (is_any_on())
         return PROTO_ERR_BUSY;
+    start_ages();
     uint8_t err = PROTO_OK;
     const uint8_t lock = board_lock();
     if (s.flags & PROTO_SHOT_ON_BUTTON) {
@@ -511,6 +525,8 @@ static void set_output(uint16_t output, bool on) // locked
     if (on) {
         s.now[r] |= b;
         s.next[r] |= b;
+        if (s.change == s.latched_change) // else it may have been off on paper only
+            s.age[output] = 0;
     } else {
         s.now[r] &= (uint8_t)~b;
         s.next[r] &= (uint8_t)~b;
@@ -702,7 +718,10 @@ uint16_t sequencer_n_on(void)
 
 uint16_t sequencer_n_guarded(void)
 {
-    return s.n_guarded;
+    const uint8_t lock = board_lock();
+    const uint16_t n = s.n_guarded;
+    board_unlock(lock);
+    return n;
 }
 
 bool sequencer_is_enabled(void)

@@ -109,7 +109,9 @@ void session_status(uint8_t out[PROTO_STATUS_BYTES])
     out[29] = head_moving();
     out[30] = head_switches();
     out[31] = e.expected;
+    const uint8_t lock = board_lock();
     proto_put_u16(out + 32, e.n_events_lost);
+    board_unlock(lock);
     proto_put_u16(out + 34, board_unused_ram());
     proto_put_u16(out + 36, e.silence_ms);
     proto_put_u16(out + 38, 0);
@@ -363,17 +365,16 @@ static bool take_button(struct button_event *out)
 static uint8_t put_inputs(uint8_t *p) // all closings of one sample that fit; 0: none
 {
     struct feedback_closing closing;
-    if (!feedback_peek(&closing))
+    uint64_t tick;
+    if (!feedback_peek(&closing, &tick))
         return 0;
-    const uint16_t sample = closing.sample;
-    proto_put_u64(p, feedback_tick(sample));
+    proto_put_u64(p, tick);
     uint8_t n = 8;
-    while (n + 2 <= PROTO_PAYLOAD_MAX && feedback_peek(&closing) && closing.sample == sample) {
+    while (n + 2 <= PROTO_PAYLOAD_MAX && feedback_take(tick, &closing)) {
         p[n++] = closing.input_register;
         p[n++] = closing.bits;
-        feedback_drop();
     }
-    return n;
+    return n > 8 ? n : 0; // a shot may have begun since
 }
 
 // One event, if there is one. Returns its type, 0: none.
@@ -452,7 +453,7 @@ void session_run(void)
     if (e.link_lost) {
         e.link_lost = false;
         end_session();
-        e.reader.n = 0;
+        e.reader.n = e.reader.n_given = 0;
     }
     if (e.open && (uint16_t)(ms - e.heard_ms) >= e.silence_ms) {
         end_session();
@@ -461,9 +462,14 @@ void session_run(void)
     }
     frame_idle(&e.reader, ms);
     uint8_t byte;
-    for (uint8_t i = 0; i < BYTES_PER_RUN && board_can_send() && board_receive(&byte); i++)
-        if (frame_push(&e.reader, byte, ms))
+    for (uint8_t i = 0; i < BYTES_PER_RUN && board_can_send(); i++) {
+        if (frame_next(&e.reader, ms))
             answer(e.reader.byte);
+        else if (board_receive(&byte))
+            frame_push(&e.reader, byte, ms);
+        else
+            break;
+    }
     if (!board_can_send())
         return;
     uint8_t event[PROTO_FRAME_MAX], n;

@@ -111,7 +111,7 @@ static enum usb_answer standard(const uint8_t *s)
     case GET_STATUS:
         return s[0] & 0x80 ? put_all((const uint8_t[]){ 0, 0 }, 2) : USB_STALL;
     case CLEAR_FEATURE:
-        return s[0] == 2 && s[2] == 0 ? USB_CLEAR_HALT : USB_STALL;
+        return s[0] == 2 && s[2] == 0 && configuration && (s[4] == PROTO_ENDPOINT_OUT || s[4] == PROTO_ENDPOINT_IN) ? USB_CLEAR_HALT : USB_STALL;
     case SET_ADDRESS:
         return s[0] == 0 && s[2] < 128 ? USB_ADDRESS : USB_STALL;
     case GET_DESCRIPTOR:
@@ -127,7 +127,7 @@ static enum usb_answer standard(const uint8_t *s)
     case GET_INTERFACE:
         return s[0] == 0x81 ? put_all((const uint8_t[]){ 0 }, 1) : USB_STALL;
     case SET_INTERFACE:
-        return s[0] == 1 && s[2] == 0 ? USB_CONFIGURED : USB_STALL;
+        return s[0] == 1 && s[2] == 0 && configuration ? USB_CONFIGURED : USB_STALL;
     }
     return USB_STALL;
 }

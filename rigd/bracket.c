@@ -146,12 +146,19 @@ static enum bracket_fault check_facts(const struct raw_frame *a, const struct ra
     return exposure > 0 ? BRACKET_FITS : BRACKET_NO_TIME;
 }
 
+// What is darker cannot be told from it.
+static double floor_radiance(const struct bracket *b, double longest)
+{
+    return b->noise.read_noise_e / (b->noise.electrons_at_white * longest);
+}
+
 // ---- rows: which sites of a frame are good ------------------------------------------------------------------------------------
 
 struct rows {
     const struct bracket *b;
     const struct raw_frame *f, *shorter; // shorter: or NULL
     double ratio; // of f's exposure to it
+    bool is_dry;  // what overflows was found not to reach its neighbours
     int next; // row whose saturation is marked next
 };
 
@@ -184,7 +191,7 @@ static void judge_row(struct rows *r, int y)
         const double black = b->like.black[y & 1][x & 1];
         b->row_quality[x] = site[x] <= black + b->usable * (b->saturation - black) ? BRACKET_GOOD : BRACKET_POOR;
     }
-    for (int v = y - reach < 0 ? 0 : y - reach; v <= y + reach && v < r->f->height; v++) {
+    for (int v = y - reach < 0 ? 0 : y - reach; v <= y + reach && v < r->f->height && !r->is_dry; v++) {
         const uint8_t *mark = b->saturated + (size_t)(v % n) * (size_t)width;
         if (!memchr(mark, OVERFLOWING, (size_t)width))
             continue;
@@ -199,12 +206,35 @@ static void judge_row(struct rows *r, int y)
             b->row_quality[x] = BRACKET_CLIPPED;
 }
 
-// ---- comparing ------------------------------------------------------------------------------------------------------------------
-
-static double floor_radiance(const struct bracket *b, double longest)
+// Most sensors of today do not bloom. The sites that the margin around overflowing ones takes out are in the next shorter frame, too, where
+// less overflows or nothing: as long as they agree there, in the mean and each within its noise, they are as good as any.
+static bool is_dry(struct rows rows, double h)
 {
-    return b->noise.read_noise_e / (b->noise.electrons_at_white * longest);
+    enum { LEAST_SITES = 100 };
+    static const double most_excess = .005, most_chi2 = 1.3;
+    const struct bracket *b = rows.b;
+    const double w = b->noise.electrons_at_white, read = b->noise.read_noise_e / w, ratio = rows.ratio;
+    double excess = 0, total = 0, chi2 = 0;
+    int64_t n = 0;
+    for (int y = 0; rows.shorter && y < rows.f->height; y++) {
+        const size_t row = (size_t)y * (size_t)rows.f->width;
+        judge_row(&rows, y);
+        for (int x = 0; x < rows.f->width; x++) {
+            const double black = b->like.black[y & 1][x & 1], site = rows.f->site[row + (size_t)x];
+            if (b->row_quality[x] != BRACKET_POOR || site > black + b->usable * (b->saturation - black))
+                continue;
+            const double range = b->like.white - black, s = (site - black) / range, p = ratio * (rows.shorter->site[row + (size_t)x] - black) / range;
+            const double m = fmax((ratio * s + p) / (1 + ratio), floor_radiance(b, h) * h); // as both say, by their exposures
+            const double d = s - p;
+            excess += d, total += m;
+            chi2 += d * d / (m / w * (1 + ratio) + read * read * (1 + ratio * ratio));
+            n++;
+        }
+    }
+    return n >= LEAST_SITES && fabs(excess) <= most_excess * total && chi2 <= most_chi2 * (double)n;
 }
+
+// ---- comparing ------------------------------------------------------------------------------------------------------------------
 
 static void compare_blocks(struct bracket *b, struct rows rows, double h)
 {
@@ -390,6 +420,7 @@ int bracket_add(struct bracket *b, const struct raw_frame *f, const struct raw_f
         return r->plateau_dn;
     if (r->plateau_dn && r->plateau_dn < b->saturation)
         b->saturation = r->plateau_dn;
+    rows.is_dry = is_dry(rows, h);
     for (int i = 0; i < b->n_taken; i++)
         r->is_repeat = r->is_repeat || fabs(h / b->taken[i] - 1) < .01;
     if (b->n_taken) {

@@ -9,7 +9,8 @@
 // sum(u h), var X = X / (w sum(u h)). That is the Poisson bound where e_i >> s^2 and the bound with read noise where not.
 //
 // A site of a frame is *good*: at most `usable` of saturation, and no site within bloom_px of it saturated by more than 1.8 times (by any,
-// where the next shorter frame cannot tell: green saturates before red and blue, and only what overflows blooms); *poor*: not saturated;
+// where the next shorter frame cannot tell: green saturates before red and blue, and only what overflows blooms; unless these neighbours,
+// as a whole, agree with the next shorter frame: then this sensor does not bloom); *poor*: not saturated;
 // *clipped*. Poor ones count only where there is no good one. Clipped in all frames: the radiance is a lower bound, y / h of the shortest.
 #pragma once
 #include "rigd/develop.h"

@@ -80,7 +80,8 @@ static const char *kind_of(enum bracket_fault f)
 
 struct shot {
     const struct panorama_frame *frame;
-    double exposure_s; // true time over the neutral-density filter
+    bool is_unreadable; // which is said where it was found
+    double exposure_s;  // true time over the neutral-density filter
     double h;
     struct bracket_frame_report report;
 };
@@ -170,7 +171,9 @@ static int merge_from(struct job *j, struct bracket **b, const struct panorama_s
         err = raw_read(&f, s->frame->file, why, sizeof(why));
         progress_add(1);
         if (err && err != -ENOMEM) {
-            find(j, DOUBT, "unreadable_frame", stop->name, s->frame->file, "left out: %s", why[0] ? why : strerror(-err));
+            if (!s->is_unreadable)
+                find(j, DOUBT, "unreadable_frame", stop->name, s->frame->file, "left out: %s", why[0] ? why : strerror(-err));
+            s->is_unreadable = true;
             s->report = (struct bracket_frame_report){ .fault = BRACKET_NO_TIME };
             err = 0;
             continue;
@@ -222,6 +225,12 @@ static void judge_frame(struct job *j, const struct panorama_stop *stop, const d
 {
     const struct bracket_frame_report *r = &shot[i].report;
     const char *file = shot[i].frame->file;
+    if (shot[i].is_unreadable)
+        return;
+    if (r->fault == BRACKET_NO_TIME) {
+        find(j, DOUBT, kind_of(r->fault), stop->name, file, "left out: it does not say its exposure time; give \"exposure_s\" in the plan");
+        return;
+    }
     if (r->fault == BRACKET_OTHER_BRIGHTNESS) {
         for (int k = 0; k < n; k++)
             if (k != i && fabs(log2(r->gain * r->exposure / shot[k].h)) < .2) {
@@ -266,7 +275,7 @@ static struct json *describe_frame(const struct shot *s)
     json_set_string(v, "file", s->frame->file);
     json_set_number(v, "exposure_s", s->exposure_s * exp2(s->frame->neutral_density_ev));
     json_set_number(v, "exposure", r->exposure);
-    json_set_string(v, "verdict", bracket_fault_text(r->fault));
+    json_set_string(v, "verdict", s->is_unreadable ? "unreadable" : bracket_fault_text(r->fault));
     json_set_number(v, "gain", r->gain);
     json_set_number(v, "gain_error", r->gain_error);
     json_set_number(v, "chi2", r->chi2);
@@ -340,6 +349,10 @@ static int do_stop(struct job *j, struct stitch *stitch, const struct panorama_s
     json_set_number(to, "roll_deg", stop->roll_deg);
     lens_head(R, stop->yaw_deg * M_PI / 180, stop->pitch_deg * M_PI / 180, stop->roll_deg * M_PI / 180);
     const int n = look_at_files(j, stop, shot);
+    const char *slash = strrchr(j->output, '/');
+    char folder[PANORAMA_FILE_MAX];
+    snprintf(folder, sizeof(folder), "%.*s", slash ? (int)(slash - j->output + 1) : 1, slash ? j->output : ".");
+    stitch_rest(stitch, folder);
     int err = n ? measure_noise(j, stop, shot, n) : 0;
     if (!err && n)
         err = merge_stop(j, &b, stop, shot, n, &facts);
@@ -366,7 +379,7 @@ static int do_stop(struct job *j, struct stitch *stitch, const struct panorama_s
     if (!err && merged.width == j->plan.lens.width_px && merged.height == j->plan.lens.height_px)
         merged_unshade(&merged, &j->plan.lens);
     if (!err)
-        err = stitch_add(stitch, &j->plan.lens, R, &merged, &seam);
+        err = stitch_add_last(stitch, &j->plan.lens, R, &merged, &seam);
     merged_free(&merged);
     if (err)
         return err;

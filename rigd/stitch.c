@@ -7,9 +7,12 @@
 #include "solver/take/log.h"
 
 #include <errno.h>
+#include <fcntl.h>
 #include <math.h>
 #include <stdlib.h>
 #include <string.h>
+#include <sys/mman.h>
+#include <unistd.h>
 
 enum { CELLS_X = 256, CELLS_Y = 128, MOST_DIVISIONS = 6, POLYGON_MAX = 16 };
 
@@ -27,6 +30,7 @@ struct cell { // of the coarse grid in which stops are compared: green, unclippe
 struct stitch {
     int width, height, n_stops;
     struct texel *texel;
+    bool is_in_file;            // texel is a file without a name, mapped
     struct texel *touched;      // the same for contributions of stops to texels where they had clipped pixels; NULL: none yet
     uint8_t *is_touched;        // [width height] of the stop being added
     double *sine;               // [height + 1] sin(latitude) of row borders
@@ -57,11 +61,42 @@ int stitch_new(struct stitch **out, int width)
     return 0;
 }
 
+// Of data, which is ours alone: the whole pages between the bytes begin and end. They take no memory from here on: a file keeps what was written,
+// other memory is zero again.
+static void leave_pages(void *data, size_t begin, size_t end)
+{
+    const uintptr_t page = (uintptr_t)sysconf(_SC_PAGESIZE), at = (uintptr_t)data;
+    const uintptr_t from = (at + begin + page - 1) / page * page, to = (at + end) / page * page;
+    if (from < to)
+        madvise((void *)from, to - from, MADV_DONTNEED);
+}
+
+void stitch_rest(struct stitch *s, const char *folder)
+{
+    const size_t n_bytes = (size_t)s->width * (size_t)s->height * sizeof(*s->texel);
+    if (!s->is_in_file && !s->n_stops) {
+        const int fd = open(folder, O_TMPFILE | O_RDWR | O_CLOEXEC, 0600);
+        void *at = fd < 0 || posix_fallocate(fd, 0, (off_t)n_bytes) ? MAP_FAILED : mmap(NULL, n_bytes, PROT_READ | PROT_WRITE, MAP_SHARED, fd, 0);
+        if (fd >= 0)
+            close(fd);
+        if (at != MAP_FAILED) {
+            free(s->texel);
+            s->texel = at;
+            s->is_in_file = true;
+        }
+    }
+    if (s->is_in_file)
+        leave_pages(s->texel, 0, n_bytes);
+}
+
 void stitch_free(struct stitch *s)
 {
     if (!s)
         return;
-    free(s->texel);
+    if (s->is_in_file)
+        munmap(s->texel, (size_t)s->width * (size_t)s->height * sizeof(*s->texel));
+    else
+        free(s->texel);
     free(s->touched);
     free(s->is_touched);
     free(s->sine);
@@ -426,7 +461,16 @@ static int compare_with_before(struct stitch *s, struct stitch_stop_report *r)
     return 0;
 }
 
-int stitch_add(struct stitch *s, const struct lens *lens, const double R[9], const struct merged *m, struct stitch_stop_report *r)
+// Of a picture that was put up to row y: what is not looked at again.
+static void leave_rows(const struct merged *m, int y)
+{
+    const size_t n = (size_t)(y > 2 ? y - 2 : 0) * (size_t)m->width;
+    leave_pages(m->radiance, 0, n * sizeof(*m->radiance));
+    leave_pages(m->variance, 0, n * sizeof(*m->variance));
+    leave_pages(m->quality, 0, n);
+}
+
+static int add_stop(struct stitch *s, const struct lens *lens, const double R[9], const struct merged *m, bool is_last_use, struct stitch_stop_report *r)
 {
     *r = (struct stitch_stop_report){ .seam_gain = 1 };
     if (lens->width_px != m->width || lens->height_px != m->height) {
@@ -444,6 +488,8 @@ int stitch_add(struct stitch *s, const struct lens *lens, const double R[9], con
     struct pixel p;
     const struct deposit d = { .s = s, .pixel = &p };
     for (int y = 0; !err && y < m->height; y++) {
+        if (is_last_use && y % 64 == 0)
+            leave_rows(m, y);
         step_row(s, &v, y);
         for (int x = 0; x < m->width; x++) {
             const struct corner *c[4];
@@ -465,6 +511,16 @@ int stitch_add(struct stitch *s, const struct lens *lens, const double R[9], con
     free(v.upper);
     free(v.lower);
     return err;
+}
+
+int stitch_add_last(struct stitch *s, const struct lens *lens, const double R[9], struct merged *m, struct stitch_stop_report *r)
+{
+    return add_stop(s, lens, R, m, true, r);
+}
+
+int stitch_add(struct stitch *s, const struct lens *lens, const double R[9], const struct merged *m, struct stitch_stop_report *r)
+{
+    return add_stop(s, lens, R, m, false, r);
 }
 
 // ---- the whole --------------------------------------------------------------------------------------------------------------------
@@ -505,6 +561,8 @@ int stitch_finish(struct image *out, struct stitch *s, const double M[9], struct
             to[6] = (float)fmin((double)t.cover / whole, 1);
             to[7] = (float)fmin((double)t.clip / w, 1);
         }
+        if (s->is_in_file && y % 64 == 63)
+            leave_pages(s->texel, 0, (size_t)(y + 1) * (size_t)s->width * sizeof(*s->texel));
     }
     const int examined = panorama_examine(report, out);
     if (examined)

@@ -42,6 +42,11 @@ int stitch_new(struct stitch **out, int width_px); // 0, -ENOMEM, -EINVAL (not e
 // merged_unshade(). 0, -ENOMEM,
 // -EINVAL (the lens is of another size than the picture; logged).
 int stitch_add(struct stitch *s, const struct lens *lens, const double probe_from_camera[9], const struct merged *m, struct stitch_stop_report *report);
+// The same, but m's pixels are forgotten as they are put, so that its memory goes back while the panorama's comes: only merged_free(m) may follow.
+int stitch_add_last(struct stitch *s, const struct lens *lens, const double probe_from_camera[9], struct merged *m, struct stitch_stop_report *report);
+// Before a while in which s is not used, and for the first time before anything is added: its sums, 36 bytes a texel, move to a file without a name in
+// folder and take no memory until stitch_add. Where that cannot be, they stay.
+void stitch_rest(struct stitch *s, const char *folder);
 // rgb_from_camera: row-major, applied at the end. Channels R, G, B, "variance.R" "variance.G" "variance.B" (of the texel's mean, camera
 // noise only: never too small; 15 % too large for texels of 10 pixels, more for smaller ones, because interpolated pixels share sites), "coverage" (1: all of the texel was seen), "clip" (share of the weight that was clipped).
 int stitch_finish(struct image *out, struct stitch *s, const double rgb_from_camera[9], struct panorama_report *report);

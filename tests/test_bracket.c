@@ -208,6 +208,57 @@ static void light_that_bloomed_over_does_not_count_while_a_clean_frame_is_there(
     free(scene);
 }
 
+// Lamps all over the frame; where they saturate, their neighbours get `spill` DN of what they cannot hold. What the neighbours' variance is
+// said to be over the Poisson bound of all frames, and their mean over the truth.
+static void beside_lamps(double spill, double *over_bound, double *mean)
+{
+    const struct sim_camera c = camera_of(2);
+    const struct bracket_options options = options_of(&c);
+    float *scene = levels(.1, .1);
+    struct raw_frame f[4];
+    struct bracket *b;
+    struct bracket_frame_report r;
+    struct merged m;
+    int64_t n[2];
+    int count = 0;
+    for (int y = 8; y < H - 8; y += 8)
+        for (int x = 8; x < W - 8; x += 8)
+            scene[y * W + x] = 20;
+    for (int i = 0; i < 4; i++) {
+        assert_int_equal(sim_expose(f + i, scene, &c, pow(.25, i), 1, (uint64_t)i), 0);
+        for (int k = 0; k < W * H - 1 && i < 2; k++)
+            if (scene[k] > 1)
+                f[i].site[k + 1] = (uint16_t)(f[i].site[k + 1] + spill);
+    }
+    assert_int_equal(bracket_new(&b, f, &options), 0);
+    for (int i = 0; i < 4; i++)
+        assert_int_equal(bracket_add(b, f + i, i < 3 ? f + i + 1 : NULL, &r), 0);
+    assert_int_equal(bracket_finish(&m, b, n, n + 1), 0);
+    *over_bound = *mean = 0;
+    for (int k = 0; k < W * H - 1; k++)
+        if (scene[k] > 1) {
+            assert_int_equal(m.quality[k + 1], BRACKET_GOOD);
+            *over_bound += (double)m.variance[k + 1] * c.electrons_at_white * (1 + .25 + .0625 + .015625) / .1;
+            *mean += (double)m.radiance[k + 1] / .1;
+            count++;
+        }
+    *over_bound /= count, *mean /= count;
+    for (int i = 0; i < 4; i++)
+        free(f[i].site);
+    merged_free(&m);
+    free(scene);
+}
+
+static void what_lies_beside_lamps_counts_in_full_on_a_sensor_that_does_not_bloom(void **state)
+{
+    (void)state;
+    double over_bound, mean;
+    beside_lamps(0, &over_bound, &mean);
+    assert_true(over_bound < 1.05 && fabs(mean - 1) < .005);
+    beside_lamps(150, &over_bound, &mean); // a tenth of what is there
+    assert_true(over_bound > 3 && fabs(mean - 1) < .01);
+}
+
 // Green saturates first: red and blue beside it still count, or coloured sensors would lose their best frame over half a stop.
 static void a_site_beside_one_that_is_just_saturated_counts(void **state)
 {
@@ -531,6 +582,7 @@ int main(void)
         cmocka_unit_test(without_read_noise_it_is_the_sum_of_signals_over_the_sum_of_exposures),
         cmocka_unit_test(a_light_that_clips_in_every_frame_is_marked_with_a_lower_bound),
         cmocka_unit_test(light_that_bloomed_over_does_not_count_while_a_clean_frame_is_there),
+        cmocka_unit_test(what_lies_beside_lamps_counts_in_full_on_a_sensor_that_does_not_bloom),
         cmocka_unit_test(a_site_beside_one_that_is_just_saturated_counts),
         cmocka_unit_test(a_stuck_site_is_no_light),
         cmocka_unit_test(frames_that_do_not_belong_are_named_and_left_out),

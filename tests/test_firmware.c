@@ -1,6 +1,7 @@
 // tests/test_firmware.c - the trigger board's logic on the host: every edge on its tick, nothing on for too long, whatever the host does.
 #include "firmware/board_sim.h"
 #include "firmware/frame.h"
+#include "firmware/usb.h"
 #include "tests/board/frames.h"
 
 #include <math.h>
@@ -148,6 +149,15 @@ static uint8_t make_frame(uint8_t *f, uint8_t n)
     return proto_seal(f, (uint8_t)any(256), (uint8_t)any(256), n);
 }
 
+// True: the byte made a frame whole.
+static bool push(struct frame_reader *r, uint8_t byte, uint16_t now_ms)
+{
+    while (frame_next(r, now_ms))
+        ;
+    frame_push(r, byte, now_ms);
+    return frame_next(r, now_ms);
+}
+
 static void a_frame_is_found_in_any_junk_that_does_not_hide_it(void **state)
 {
     (void)state;
@@ -157,11 +167,11 @@ static void a_frame_is_found_in_any_junk_that_does_not_hide_it(void **state)
         uint8_t f[PROTO_FRAME_MAX];
         const uint8_t n = make_frame(f, (uint8_t)any(PROTO_PAYLOAD_MAX + 1));
         for (uint32_t junk = any(40); junk > 0; junk--)
-            assert_false(frame_push(&r, junk == 2 ? PROTO_SYNC_0 : junk == 1 ? PROTO_SYNC_1 : (uint8_t)any(PROTO_SYNC_0), 0));
+            assert_false(push(&r, junk == 2 ? PROTO_SYNC_0 : junk == 1 ? PROTO_SYNC_1 : (uint8_t)any(PROTO_SYNC_0), 0));
         // The junk may look like the begin of a frame: then the real one is found when that has failed, at the latest with 61 bytes more.
         bool found = false;
         for (uint8_t i = 0; i < n + 61 && !found; i++)
-            found = frame_push(&r, i < n ? f[i] : 0, 0);
+            found = push(&r, i < n ? f[i] : 0, 0);
         assert_true(found);
         assert_memory_equal(r.byte, f, n);
     }
@@ -178,7 +188,7 @@ static void a_frame_with_any_bit_wrong_is_no_frame(void **state)
             struct frame_reader r = { 0 };
             f[bit / 8] ^= (uint8_t)(1 << bit % 8);
             for (uint8_t i = 0; i < n; i++)
-                assert_false(frame_push(&r, f[i], 0));
+                assert_false(push(&r, f[i], 0));
             f[bit / 8] ^= (uint8_t)(1 << bit % 8);
         }
     }
@@ -191,15 +201,84 @@ static void a_frame_that_does_not_end_is_given_up(void **state)
     uint8_t f[PROTO_FRAME_MAX];
     const uint8_t n = make_frame(f, 20);
     for (uint8_t i = 0; i < n - 1; i++)
-        frame_push(&r, f[i], 65500);
+        push(&r, f[i], 65500);
     frame_idle(&r, (uint16_t)(65500 + PROTO_FRAME_GAP_MS - 1));
     assert_int_equal(r.n, n - 1);
     frame_idle(&r, (uint16_t)(65500 + PROTO_FRAME_GAP_MS)); // the clock wrapped
     assert_int_equal(r.n, 0);
     assert_int_equal(r.n_bad, 1);
-    assert_false(frame_push(&r, f[n - 1], 0));
+    assert_false(push(&r, f[n - 1], 0));
     for (uint8_t i = 0; i < n; i++)
-        assert_int_equal(frame_push(&r, f[i], 1), i == n - 1);
+        assert_int_equal(push(&r, f[i], 1), i == n - 1);
+}
+
+// What begins like a long frame and is none may hold several short ones: each is given out once, in order, and none is written past the end.
+static void frames_hidden_in_a_broken_one_are_given_out_once_each(void **state)
+{
+    (void)state;
+    seed = 3;
+    for (int round = 0; round < 2000; round++) {
+        struct frame_reader r = { 0 };
+        uint8_t bytes[400], sent[12];
+        int n = 0, n_sent = 0, n_found = 0;
+        for (int burst = 0; burst < 3; burst++) {
+            const uint8_t begin[3] = { PROTO_SYNC_0, PROTO_SYNC_1, (uint8_t)any(PROTO_PAYLOAD_MAX + 1) };
+            memcpy(bytes + n, begin, sizeof(begin));
+            n += sizeof(begin);
+            for (uint32_t k = 1 + any(4); k > 0; k--) {
+                uint8_t f[PROTO_FRAME_MAX];
+                const uint8_t n_frame = make_frame(f, (uint8_t)any(12));
+                memcpy(bytes + n, f, n_frame);
+                n += n_frame, sent[n_sent++] = f[3];
+            }
+        }
+        memset(bytes + n, 0, PROTO_FRAME_MAX);
+        n += PROTO_FRAME_MAX;
+        for (int i = 0; i < n; i++) {
+            frame_push(&r, bytes[i], 0);
+            while (frame_next(&r, 0)) {
+                assert_true(n_found < n_sent && r.byte[3] == sent[n_found]);
+                n_found++;
+            }
+            assert_true(r.n < PROTO_FRAME_MAX);
+        }
+        assert_int_equal(n_found, n_sent);
+    }
+}
+
+// A host that died amid a frame leaves its begin; the next one's HELLO comes at once and must not be lost with it.
+static void a_hello_behind_half_a_frame_is_answered(void **state)
+{
+    (void)state;
+    start_at(0);
+    board_sim_write((const uint8_t[]){ PROTO_SYNC_0, PROTO_SYNC_1, PROTO_PAYLOAD_MAX, 1, PROTO_SHOT_TOGETHER, 7 }, 6);
+    board_sim_run(MS);
+    uint8_t hello[PROTO_FRAME_MAX], packet[PROTO_PACKET_BYTES];
+    proto_put_u16(hello + PROTO_HEADER_BYTES, PROTO_VERSION);
+    board_sim_write(hello, proto_seal(hello, PROTO_HELLO, 9, 2));
+    board_sim_run((PROTO_FRAME_GAP_MS + 20) * MS);
+    assert_int_equal(board_sim_read(packet), PROTO_HEADER_BYTES + 1 + PROTO_CAPABILITIES_BYTES + PROTO_CRC_BYTES);
+    assert_int_equal(packet[4], PROTO_HELLO | PROTO_REPLY);
+    assert_int_equal(packet[PROTO_HEADER_BYTES], PROTO_OK);
+}
+
+// ---- USB ------------------------------------------------------------------------------------------------------------------------------
+static void endpoints_that_there_are_not_are_stalled(void **state)
+{
+    (void)state;
+    start_at(0);
+    usb_reset();
+    uint8_t clear_halt[8] = { 2, 1, 0, 0, PROTO_ENDPOINT_IN, 0, 0, 0 };
+    const uint8_t set_interface[8] = { 1, 11, 0, 0, 0, 0, 0, 0 }, set_configuration[8] = { 0, 9, 1, 0, 0, 0, 0, 0 };
+    assert_int_equal(usb_setup(clear_halt, 0), USB_STALL); // not configured: there is none yet
+    assert_int_equal(usb_setup(set_interface, 0), USB_STALL);
+    assert_int_equal(usb_setup(set_configuration, 0), USB_CONFIGURED);
+    assert_int_equal(usb_setup(set_interface, 0), USB_CONFIGURED);
+    for (int endpoint = 0; endpoint < 256; endpoint++) {
+        clear_halt[4] = (uint8_t)endpoint;
+        const bool is_ours = endpoint == PROTO_ENDPOINT_OUT || endpoint == PROTO_ENDPOINT_IN;
+        assert_int_equal(usb_setup(clear_halt, 0), is_ours ? USB_CLEAR_HALT : USB_STALL);
+    }
 }
 
 // ---- sessions -------------------------------------------------------------------------------------------------------------------------
@@ -602,6 +681,33 @@ static void a_late_board_says_how_late_and_gives_up_what_is_too_late(void **stat
 }
 
 // ---- nothing stays on -----------------------------------------------------------------------------------------------------------------
+// The guard looks at each register every 64 ms: what went off and on again between two looks has not been on all the time.
+static void what_is_pressed_again_at_once_is_granted_its_whole_time_again(void **state)
+{
+    (void)state;
+    start();
+    struct frames_shot s = plain_shot(200);
+    struct frames_event e;
+    s.lead = 0, s.hold = 1200 * MS;
+    for (int round = 0; round < 4; round++) {
+        assert_int_equal(frames_load(&host, &s), PROTO_OK);
+        assert_int_equal(frames_commit(&host, &s, frames_now(&host) + 10 * MS), PROTO_OK);
+        assert_true(frames_listen(&host, 1500 * MS, PROTO_FIRED, &e));
+        assert_int_equal(e.payload[2], PROTO_FIRED_DONE);
+        for (int i = 0; i < 200; i++)
+            assert_true(seen.off[i] - seen.on[i] >= s.hold);
+    }
+    const uint8_t on[3] = { 144, 1, 1 }, off[3] = { 144, 1, 0 }; // output 400, 5000 ms
+    for (int round = 0; round < 4; round++) {
+        assert_int_equal(frames_command(&host, PROTO_OUTPUT, on, 3, NULL), PROTO_OK);
+        frames_run(&host, 4000 * MS);
+        assert_true(is_on(400));
+        assert_int_equal(frames_command(&host, PROTO_OUTPUT, off, 3, NULL), PROTO_OK);
+        frames_run(&host, MS); // off indeed
+    }
+    check_on_times();
+}
+
 static void an_output_left_on_goes_off_by_itself_in_time(void **state)
 {
     (void)state;
@@ -1223,6 +1329,9 @@ int main(void)
         cmocka_unit_test(a_frame_is_found_in_any_junk_that_does_not_hide_it),
         cmocka_unit_test(a_frame_with_any_bit_wrong_is_no_frame),
         cmocka_unit_test(a_frame_that_does_not_end_is_given_up),
+        cmocka_unit_test(frames_hidden_in_a_broken_one_are_given_out_once_each),
+        cmocka_unit_test(a_hello_behind_half_a_frame_is_answered),
+        cmocka_unit_test(endpoints_that_there_are_not_are_stalled),
         cmocka_unit_test(nothing_is_done_without_a_session_or_out_of_sequence),
         cmocka_unit_test(a_command_of_the_wrong_length_or_value_changes_nothing),
         cmocka_unit_test(capabilities_and_status_say_what_is),
@@ -1232,6 +1341,7 @@ int main(void)
         cmocka_unit_test(a_shot_that_cannot_be_done_is_refused_as_a_whole),
         cmocka_unit_test(a_release_in_the_middle_lets_go_at_once_and_says_so),
         cmocka_unit_test(a_late_board_says_how_late_and_gives_up_what_is_too_late),
+        cmocka_unit_test(what_is_pressed_again_at_once_is_granted_its_whole_time_again),
         cmocka_unit_test(an_output_left_on_goes_off_by_itself_in_time),
         cmocka_unit_test(a_silent_host_leaves_nothing_on_in_any_state),
         cmocka_unit_test(a_host_that_does_not_read_is_silent_too),

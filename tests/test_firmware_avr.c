@@ -101,7 +101,7 @@ static int setup(void **state)
     return 0;
 }
 
-// Whatever a test did: the core did not crash, no interrupt waited too long, the stack left some RAM.
+// Whatever a test did: the core did not crash, no interrupt waited too long, no packet was thrown away unsent.
 static int teardown(void **state)
 {
     (void)state;
@@ -111,6 +111,10 @@ static int teardown(void **state)
             fprintf(stderr, "# vector %d, %s, waited %u cycles\n", v, simavr_board_vector_name(v), simavr_board_latency(board)[v]);
             err = -1;
         }
+    if (simavr_board_killed(board)) {
+        fprintf(stderr, "# %u times a packet to the host was killed\n", simavr_board_killed(board));
+        err = -1;
+    }
     simavr_board_close(board);
     return err;
 }

@@ -122,6 +122,7 @@ static int run_with(const struct mishap *m)
 }
 
 // How many findings of a kind (of a stop and file, as far as given).
+// NULL: any.
 static int found(const char *kind, const char *stop, const char *file)
 {
     int n = 0;
@@ -133,7 +134,7 @@ static int found(const char *kind, const char *stop, const char *file)
         json_get_string(v, "kind", &k);
         json_get_string(v, "stop", &s);
         json_get_string(v, "file", &f);
-        n += !strcmp(k, kind) && (!stop || !strcmp(s, stop)) && (!file || strstr(f, file));
+        n += (!kind || !strcmp(k, kind)) && (!stop || !strcmp(s, stop)) && (!file || strstr(f, file));
     }
     return n;
 }
@@ -286,6 +287,17 @@ static void missing_stops_and_frames_are_named(void **state)
     assert_int_equal(run_with(&none), 3);
     show("not a raw");
     assert_int_equal(found("unreadable_frame", "s0", "s0_3.dng"), 1);
+    shoot(0, 3, &none);
+    struct raw_frame f; // its head can be read, its photosites make no sense: said once, and as what it is
+    struct sim_camera c = camera;
+    c.black = c.white;
+    assert_int_equal(sim_expose(&f, seen[0], &c, true_s[3], 1, 3), 0);
+    assert_int_equal(sim_write_dng(&f, &c, scratch_path("s0_3.dng"), label_s[3], "1", (START + (int64_t)30) * 1000000000), 0);
+    free(f.site);
+    assert_int_equal(run_with(&none), 3);
+    show("no photosites");
+    assert_int_equal(found("unreadable_frame", "s0", "s0_3.dng"), 1);
+    assert_int_equal(found(NULL, "s0", "s0_3.dng"), 1);
     shoot(0, 3, &none);
 }
 

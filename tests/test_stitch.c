@@ -240,6 +240,41 @@ static void stops_join_without_a_seam_and_a_stop_in_the_wrong_place_shows(void *
     image_free(&truth);
 }
 
+// Sums that rest in a file, and pictures that are forgotten as they are put, change nothing; nor does a folder that takes no file.
+static void resting_in_a_file_changes_no_byte(void **state)
+{
+    (void)state;
+    static const char *const folders[] = { NULL, ".", "/nowhere/at/all" };
+    const double lamp[3] = { .6, .64, .48 };
+    struct sim_camera c = fisheye(700, 95);
+    struct image truth, out[3];
+    room(&truth, 256, 1, lamp);
+    for (int k = 0; k < 3; k++) {
+        struct stitch *s;
+        struct stitch_stop_report r;
+        struct panorama_report whole;
+        assert_int_equal(stitch_new(&s, 256), 0);
+        for (int stop = 0; stop < 2; stop++) {
+            struct merged m;
+            double R[9];
+            c.yaw_deg = 180 * stop;
+            if (folders[k])
+                stitch_rest(s, folders[k]);
+            look(&m, &truth, &c, 1);
+            m.quality[350 * 700 + 350] = BRACKET_CLIPPED;
+            lens_head(R, c.yaw_deg * deg, 0, 0);
+            assert_int_equal(folders[k] ? stitch_add_last(s, &c.lens, R, &m, &r) : stitch_add(s, &c.lens, R, &m, &r), 0);
+            merged_free(&m);
+        }
+        assert_int_equal(stitch_finish(out + k, s, identity, &whole), 0);
+        stitch_free(s);
+        assert_memory_equal(out[k].data, out[0].data, 256 * 128 * (size_t)out[0].n_channels * sizeof(float));
+    }
+    for (int k = 0; k < 3; k++)
+        image_free(out + k);
+    image_free(&truth);
+}
+
 static void a_clipped_light_is_declared_unless_another_stop_saw_it(void **state)
 {
     (void)state;
@@ -406,6 +441,7 @@ int main(void)
         cmocka_unit_test(flux_is_kept),
         cmocka_unit_test(a_lamp_lies_where_it_is),
         cmocka_unit_test(stops_join_without_a_seam_and_a_stop_in_the_wrong_place_shows),
+        cmocka_unit_test(resting_in_a_file_changes_no_byte),
         cmocka_unit_test(a_clipped_light_is_declared_unless_another_stop_saw_it),
         cmocka_unit_test(the_variance_is_that_of_the_texels),
         cmocka_unit_test(shading_is_taken_off_and_the_matrix_applied),

@@ -8,6 +8,7 @@
 // - force-compare (FOC1A) does nothing: the timer's copy of the latch pin is not modelled in simavr either, so nothing is missed;
 // - a bulk IN endpoint answers an empty packet where it should answer NAK: this firmware never sends one, so empty means NAK;
 // - suspend never comes: made by hand;
+// - KILLBK, which throws away what an IN endpoint was given, does nothing: it is counted, and a test wants none;
 // - after a reset the ports' IRQs keep their old values, and the inputs read 0;
 // - sleeping sleeps in real time.
 #include "tests/board/simavr_board.h"
@@ -37,7 +38,9 @@ const char *__lsan_default_suppressions(void)
 enum { // data addresses
     DDRB = 0x24, PORTB = 0x25, PIND = 0x29, PINE = 0x2C, PINF = 0x2F, TIFR0 = 0x35, TIFR1 = 0x36, SPCR = 0x4C, SPSR = 0x4D,
     SPDR = 0x4E, MCUSR = 0x54, TCCR1A = 0x80, USBCON = 0xD8, USBINT = 0xDA, UDCON = 0xE0, UDINT = 0xE1, UDIEN = 0xE2,
+    UEINTX = 0xE8, UENUM = 0xE9,
 };
+enum { KILLBK = 1 << 2, IN_ENDPOINT = 2 };
 enum { SPIF = 0x80, SUSPI = 1, DETACH = 1, LED = 1 << 0, LOAD = 1 << 4, LATCH = 1 << 5, ENABLE = 1 << 6, USB_GEN = 10, N_AXES = 2 };
 enum { CONTROL_TIMEOUT = 50 * (SIMAVR_HZ / 1000), POLL_CYCLES = 160 };
 
@@ -47,7 +50,7 @@ struct simavr_board {
     avr_timer_t *timer1;
     uint64_t clock_start; // cycle at which timer 1 began to count
     bool clock_runs, dead;
-    unsigned n_resets;
+    unsigned n_resets, n_killed;
     int n_registers;
     void (*core_reset)(struct avr_t *);
     // the chains
@@ -278,6 +281,13 @@ static void quiet(avr_t *avr, const int level, const char *format, va_list argum
         vfprintf(stderr, format, arguments);
 }
 
+static void ueintx_write(avr_t *avr, avr_io_addr_t addr, uint8_t value, void *param)
+{
+    struct simavr_board *b = param;
+    (void)addr;
+    b->n_killed += (avr->data[UENUM] & 7) == IN_ENDPOINT && (value & KILLBK);
+}
+
 // ---- open -----------------------------------------------------------------------------------------------------------------------------------
 static avr_timer_t *find_timer1(avr_t *avr)
 {
@@ -297,6 +307,7 @@ static void wire(struct simavr_board *b)
     avr->io[AVR_DATA_TO_IO(TIFR0)].w.c = avr->io[AVR_DATA_TO_IO(TIFR1)].w.c = tifr_write;
     avr->io[AVR_DATA_TO_IO(TIFR0)].w.param = avr->io[AVR_DATA_TO_IO(TIFR1)].w.param = b;
     avr_register_io_write(avr, TCCR1A, tccr1a_write, b);
+    avr_register_io_write(avr, UEINTX, ueintx_write, b);
     avr_register_io_write(avr, UDINT, flags_write, b);
     avr_register_io_write(avr, USBINT, flags_write, b);
     avr_irq_register_notify(pin(b, 'B', 5), on_latch, b);
@@ -430,6 +441,11 @@ bool simavr_board_led(const struct simavr_board *b)
 unsigned simavr_board_resets(const struct simavr_board *b)
 {
     return b->n_resets;
+}
+
+unsigned simavr_board_killed(const struct simavr_board *b)
+{
+    return b->n_killed;
 }
 
 // ---- hands ------------------------------------------------------------------------------------------------------------------------------------

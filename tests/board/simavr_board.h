@@ -39,6 +39,7 @@ void simavr_board_home(struct simavr_board *b, int axis, bool closed);
 enum simavr_cause { SIMAVR_POWER, SIMAVR_PIN, SIMAVR_BROWN_OUT };
 void simavr_board_reset(struct simavr_board *b, enum simavr_cause cause); // held for no time; the host sees it leave the bus
 void simavr_board_hang(struct simavr_board *b);                           // the main loop stands still, where it is now
+unsigned simavr_board_killed(const struct simavr_board *b);               // packets that the chip would have thrown away unsent
 unsigned simavr_board_resets(const struct simavr_board *b);               // also by the watchdog
 
 // ---- the USB host --------------------------------------------------------------------------------------------------------------------
