@@ -205,6 +205,8 @@ int64_t rig_deadline_ns(const struct rig *r)
             due = sooner(due, b->heartbeat_ns);
         if (b->condition == RIG_RECOVERING)
             due = sooner(due, b->trouble_ns + TROUBLE_MS * MS);
+        if (b->condition == RIG_RECOVERING && b->start_ns && !b->worker)
+            due = sooner(due, b->start_ns);
         if (b->condition == RIG_QUARANTINED && r->phase == PHASE_IDLE && !b->worker)
             due = sooner(due, b->again_ns);
     }
@@ -497,7 +499,7 @@ int rig_identify(struct rig *r, int64_t now, int i, char *why)
         snprintf(why, 200, "%s", r->phase != PHASE_IDLE ? "a take is under way; wait for it" : "this camera does not answer");
         return -EBUSY;
     }
-    r->body[i].identify = true;
+    r->body[i].identify = r->body[i].identifying = true;
     rig_pump(r, i, now);
     return 0;
 }
@@ -513,7 +515,7 @@ int rig_reinstate(struct rig *r, int64_t now, int i, char *why)
         return 0;
     b->condition = RIG_RECOVERING;
     b->trouble_ns = now;
-    b->rung = 0;
+    b->rung = b->n_starts = 0;
     b->suspect = CAMERA_OPEN;
     if (!b->worker)
         rig_start_worker(r, i, now); // else it is being killed: its end starts the next

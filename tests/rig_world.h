@@ -36,6 +36,7 @@ struct fault {
     int extra;          // writes one file more
     bool wrong_setting, low_battery, autofocus, no_card;
     int unreadable;     // LibRaw does not know this copy
+    int no_start;       // its worker cannot be started (no memory, no program)
     int late_file;      // the picture is announced and listed after the next exposure only
 };
 
@@ -95,7 +96,9 @@ static struct world {
     int64_t open_first_ns[N_MAX];
     bool supply_off[N_MAX];
     // what was seen
-    int n_takes_done, n_preflights_done, n_lags_done, n_kills, n_said;
+    int n_takes_done, n_preflights_done, n_lags_done, n_kills, n_said, n_not_started;
+    int n_identified[N_MAX];
+    char identified[320]; // the last one's text
     uint64_t trace; // hash of all actions
     char said[400][320];
     int64_t quarantined_ns[N_MAX], ready_again_ns[N_MAX];
@@ -462,6 +465,12 @@ static inline void obey(const struct rig_action *a)
         c->worker = true;
         c->generation++;
         c->in_flight = c->open = false;
+        if (strikes(&c->fault.no_start)) {
+            c->worker = false;
+            w.n_not_started++;
+            rig_worker_gone(w.rig, w.now, a->camera, "cannot start: Cannot allocate memory");
+            break;
+        }
         later((int64_t)(uniform(30, 90) * MS), W_HELLO, a->camera, 0);
         break;
     case RIG_KILL:
@@ -571,6 +580,8 @@ static inline void obey(const struct rig_action *a)
             w.silent_until_ns = 0; // no shot
         break;
     case RIG_IDENTIFIED:
+        w.n_identified[a->camera]++;
+        memcpy(w.identified, a->text, sizeof(w.identified));
         break;
     case RIG_HEAD:
         assert_false(w.shutters_held);

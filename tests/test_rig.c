@@ -229,6 +229,49 @@ static void a_camera_that_stays_busy_is_quarantined_after_5_s(void **state)
     tear_down();
 }
 
+// No memory for a process, or no program: other cameras and clients are heard meanwhile.
+static void a_worker_that_cannot_be_started_is_not_tried_without_end(void **state)
+{
+    (void)state;
+    set_up(4, 9);
+    w.camera[1].fault.no_start = 1000;
+    open_all();
+    run(60 * S, false);
+    assert_true(w.quarantined_ns[1] > 0);
+    assert_in_range(w.n_not_started, 3, 60); // at most twenty in each of three troubles
+    w.camera[1].fault.no_start = 0;
+    run(90 * S, false);
+    assert_int_equal(rig_camera(w.rig, 1).condition, RIG_READY);
+    tear_down();
+}
+
+// Whatever becomes of the camera: who waits for the answer gets it, once.
+static void who_asks_which_camera_it_is_gets_an_answer(void **state)
+{
+    (void)state;
+    for (int story = 0; story < 7; story++) {
+        char why[200];
+        set_up(4, 70 + (uint64_t)story);
+        open_all();
+        run(S, false);
+        struct fault *f = &w.camera[1].fault;
+        f->hang[CAMERA_IDENTIFY] = story == 1;
+        f->crash[CAMERA_IDENTIFY] = story == 2;
+        f->lost[CAMERA_IDENTIFY] = story == 3;
+        f->busy[CAMERA_IDENTIFY] = story == 4 ? 2 : story == 5 ? -1 : 0;
+        f->fails[CAMERA_IDENTIFY] = story == 6;
+        f->trouble = CAMERA_REFUSED;
+        assert_int_equal(rig_identify(w.rig, w.now, 1, why), 0);
+        run(30 * S, false);
+        assert_int_equal(w.n_identified[1], 1);
+        if (story == 0 || story == 4) // it was busy for a moment
+            assert_string_equal(w.identified, "");
+        else
+            assert_true(w.identified[0]);
+        tear_down();
+    }
+}
+
 static void an_unfit_camera_stops_the_take_unless_it_may_be_left_out(void **state)
 {
     (void)state;
@@ -572,6 +615,8 @@ int main(void)
         cmocka_unit_test(others_do_not_wait_for_a_camera_in_trouble),
         cmocka_unit_test(a_camera_is_recovered_or_quarantined_within_15_s),
         cmocka_unit_test(a_camera_that_stays_busy_is_quarantined_after_5_s),
+        cmocka_unit_test(a_worker_that_cannot_be_started_is_not_tried_without_end),
+        cmocka_unit_test(who_asks_which_camera_it_is_gets_an_answer),
         cmocka_unit_test(an_unfit_camera_stops_the_take_unless_it_may_be_left_out),
         cmocka_unit_test(a_full_disk_stops_before_the_shutters),
         cmocka_unit_test(a_ledger_that_cannot_be_written_leaves_the_frames_on_the_cards),
