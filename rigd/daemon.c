@@ -573,6 +573,10 @@ static int begin_take(struct daemon *d, enum ledger_kind kind, const char *name,
     const time_t t = (time_t)(utc / 1000);
     struct tm tm;
     size_t n = 0;
+    if (d->n_unfinished) { // whoever asks, the button too: its ledger is being read, and the next take done is that one
+        snprintf(why, 200, "an unfinished take is being collected; wait for it");
+        return -EBUSY;
+    }
     for (; name[n] && n < sizeof(plain) - 1; n++)
         plain[n] = isalnum((unsigned char)name[n]) && (unsigned char)name[n] < 0x80 ? name[n] : '-';
     plain[n] = 0;
@@ -947,9 +951,7 @@ static void ask_capture(struct daemon *d, uint64_t token, const struct json *req
     char why[200];
     json_get_string(request, "name", &name);
     json_get_bool(request, "without_missing", &without_missing);
-    const int err = d->n_unfinished ? -EBUSY : capture(d, name, without_missing, why);
-    if (d->n_unfinished)
-        snprintf(why, sizeof(why), "an unfinished take is being collected; wait for it");
+    const int err = capture(d, name, without_missing, why);
     if (err)
         refuse(d, token, err, why);
     else
@@ -961,9 +963,7 @@ static void ask_panorama(struct daemon *d, uint64_t token, const struct json *re
     const char *name = "panorama";
     char why[200];
     json_get_string(request, "name", &name);
-    const int err = d->n_unfinished ? -EBUSY : begin_take(d, LEDGER_PANORAMA, name, false, why);
-    if (d->n_unfinished)
-        snprintf(why, sizeof(why), "an unfinished take is being collected; wait for it");
+    const int err = begin_take(d, LEDGER_PANORAMA, name, false, why);
     if (err)
         refuse(d, token, err, why);
     else
