@@ -921,6 +921,10 @@ static void on_added(void *arg, uint64_t token, const char *take, int err, const
             if (err)
                 d->waiter[i].token = 0;
         }
+    if (err && d->once && !strcmp(d->once_take, take)) { // nothing else will end it
+        d->exit_code = 1;
+        sd_event_exit(d->event, 0);
+    }
     if (err && !token)
         log_error("take %s: cannot be processed: %s", take, why[0] ? why : strerror(-err));
     else if (err)
