@@ -433,7 +433,8 @@ static int take_result(const struct arguments *a, struct json *request)
     const int err = ask_and_print(a, request, true, print_take, &answer);
     if (err)
         return err;
-    const bool good = !strcmp(text_of(answer, "result.state"), "verified");
+    const char *state = text_of(answer, "result.state"); // one that is resumed may have come further before
+    const bool good = !strcmp(state, "verified") || !strcmp(state, "developed") || !strcmp(state, "solved");
     json_free(answer);
     return good ? EXIT_DONE : EXIT_FAILED;
 }
