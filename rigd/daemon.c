@@ -566,7 +566,7 @@ static void fire(struct daemon *d, const struct trigger_shot *shot)
 
 // ---- takes ---------------------------------------------------------------------------------------------------------------------------------
 
-static int begin_take(struct daemon *d, enum ledger_kind kind, const char *name, bool without_missing, char *why)
+static int begin_take(struct daemon *d, enum ledger_kind kind, const char *name, bool without_missing, bool on_button, char *why)
 {
     char plain[41], id[96], created[40], stamp[40];
     const int64_t utc = utc_ms();
@@ -585,7 +585,7 @@ static int begin_take(struct daemon *d, enum ledger_kind kind, const char *name,
     strftime(stamp, sizeof(stamp), "%Y%m%dT%H%M%S", &tm);
     snprintf(id, sizeof(id), "%s%03d_%s", stamp, (int)(utc % 1000), plain);
     const struct rig_take take = { .id = id, .name = plain, .created = created, .utc_ms = utc, .takes_dir = d->takes_dir,
-                                   .panorama_take = kind == LEDGER_CAPTURE ? d->panorama_take : NULL };
+                                   .panorama_take = kind == LEDGER_CAPTURE ? d->panorama_take : NULL, .on_button = on_button };
     const int err = kind == LEDGER_PANORAMA ? rig_panorama(d->rig, now_ns(), &take, why) : rig_capture(d->rig, now_ns(), &take, without_missing, why);
     if (!err)
         d->take_began_ns = now_ns();
@@ -594,7 +594,7 @@ static int begin_take(struct daemon *d, enum ledger_kind kind, const char *name,
 
 static int capture(struct daemon *d, const char *name, bool without_missing, char *why)
 {
-    return begin_take(d, LEDGER_CAPTURE, name, without_missing, why);
+    return begin_take(d, LEDGER_CAPTURE, name, without_missing, false, why);
 }
 
 // Ids begin with their time.
@@ -951,11 +951,12 @@ static void refuse(struct daemon *d, uint64_t token, int err, const char *why)
 static void ask_capture(struct daemon *d, uint64_t token, const struct json *request)
 {
     const char *name = "take";
-    bool without_missing = false;
+    bool without_missing = false, on_button = false;
     char why[200];
     json_get_string(request, "name", &name);
     json_get_bool(request, "without_missing", &without_missing);
-    const int err = capture(d, name, without_missing, why);
+    json_get_bool(request, "on_button", &on_button);
+    const int err = begin_take(d, LEDGER_CAPTURE, name, without_missing, on_button, why);
     if (err)
         refuse(d, token, err, why);
     else
@@ -967,7 +968,7 @@ static void ask_panorama(struct daemon *d, uint64_t token, const struct json *re
     const char *name = "panorama";
     char why[200];
     json_get_string(request, "name", &name);
-    const int err = begin_take(d, LEDGER_PANORAMA, name, false, why);
+    const int err = begin_take(d, LEDGER_PANORAMA, name, false, false, why);
     if (err)
         refuse(d, token, err, why);
     else
@@ -1113,12 +1114,17 @@ static struct json *describe_all_but_cameras(struct daemon *d)
     char refusal[160] = "";
     if (d->n_unfinished)
         snprintf(refusal, sizeof(refusal), "an unfinished take is being collected; wait for it");
+    else if (rig_waits_for_button(d->rig))
+        snprintf(refusal, sizeof(refusal), "armed: the trigger's button fires; cancel (rigctl cancel) disarms");
     else if (rig_is_busy(d->rig))
         snprintf(refusal, sizeof(refusal), "the rig is busy (%s); wait for it", take_state_name(rig_state(d->rig)));
     else if (!d->trigger)
         snprintf(refusal, sizeof(refusal), "the trigger is %s: check its cable and power; rigctl doctor says more", d->trigger_word);
     if (refusal[0])
         json_set_string(o, "refusal", refusal);
+    if (d->trigger && (trigger_abilities(d->trigger) & TRIGGER_BUTTON)) // what pressing it would do now
+        json_set_string(o, "button", rig_waits_for_button(d->rig) ? "fires" : refusal[0] ? "refused" : "takes");
+    json_set_bool(o, "can_arm", d->trigger && (trigger_abilities(d->trigger) & TRIGGER_WAITS));
     json_set(o, "processing", workshop_describe_all(d->workshop));
     if (d->web)
         json_set_string(o, "page", web_address(d->web));

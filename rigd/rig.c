@@ -324,12 +324,17 @@ int rig_capture(struct rig *r, int64_t now, const struct rig_take *take, bool wi
     const int err = rig_may_begin(r, true, why);
     if (err)
         return err;
+    if (take->on_button && !(r->abilities & TRIGGER_WAITS)) {
+        snprintf(why, 200, "this trigger has no button that fires by itself; a trigger board ([trigger] kind = usb) has");
+        return -EINVAL;
+    }
     rig_new_ledger(r);
     ledger_init(&r->ledger, r->config);
     if (!r->ledger.camera)
         abort();
     rig_name_take(r, now, take);
     r->without_missing = without_missing;
+    r->on_button = take->on_button;
     r->purpose = FOR_TAKE;
     rig_set_state(r, TAKE_PREFLIGHT);
     rig_begin_preflight(r, now);
@@ -641,6 +646,11 @@ enum take_state rig_state(const struct rig *r)
     if (r->purpose == FOR_TAKE || r->purpose == FOR_RESUME || r->purpose == FOR_PANORAMA)
         return r->ledger.state;
     return r->phase == PHASE_PREFLIGHT ? TAKE_PREFLIGHT : r->phase == PHASE_COLLECT ? TAKE_COLLECTING : r->phase == PHASE_ARM ? TAKE_ARMED : TAKE_EXPOSING;
+}
+
+bool rig_waits_for_button(const struct rig *r)
+{
+    return r->phase == PHASE_FIRE && r->purpose == FOR_TAKE && r->on_button;
 }
 
 bool rig_is_busy(const struct rig *r)

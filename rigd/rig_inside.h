@@ -94,7 +94,7 @@ struct rig {
     enum purpose purpose;
     int64_t phase_due_ns;
     int n_pending, n_wanted; // bodies with a step | that the take wants
-    bool cancelled, without_missing;
+    bool cancelled, without_missing, on_button;
     char outcome[200]; // why the last take, preflight or calibration failed; "" it did not
     bool created; // the take's folder is there
     bool has_ledger;

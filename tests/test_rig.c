@@ -556,6 +556,53 @@ static void cancelling_before_the_shot_costs_nothing_after_it_no_frame(void **st
     }
 }
 
+// Armed is armed: minutes later a press fires, no camera hears anything meanwhile, and who cancels has pressed nothing.
+static void armed_it_waits_for_the_button(void **state)
+{
+    (void)state;
+    for (int story = 0; story < 3; story++) {
+        char why[200];
+        set_up(4, 90 + (uint64_t)story);
+        open_all();
+        const struct rig_take take = { "20261122T090000_c", "c", "", 0, "/takes", NULL, true };
+        assert_int_equal(rig_capture(w.rig, w.now, &take, false, why), -EINVAL); // this trigger's button only tells us
+        assert_non_null(strstr(why, "trigger board"));
+        w.abilities |= TRIGGER_BUTTON | TRIGGER_WAITS;
+        rig_trigger_is(w.rig, w.now, w.abilities);
+        for (int i = 0; i < 4; i++)
+            w.camera[i].take_first = w.camera[i].n_card + 1;
+        assert_int_equal(rig_capture(w.rig, w.now, &take, false, why), 0);
+        assert_false(rig_waits_for_button(w.rig));
+        run(300 * S, true);
+        assert_true(w.waits_for_button);
+        assert_true(rig_waits_for_button(w.rig));
+        assert_int_equal(rig_state(w.rig), TAKE_ARMED);
+        assert_int_equal(rig_deadline_ns(w.rig), INT64_MAX);
+        if (story == 0) {
+            press_button();
+        } else if (story == 1) {
+            assert_int_equal(rig_cancel(w.rig, w.now, why), 0);
+        } else { // the link breaks: perhaps it was pressed, the cards will tell
+            w.waits_for_button = false;
+            w.silent_until_ns = 0;
+            rig_fired(w.rig, w.now, -EIO, 0, 0);
+        }
+        drain_actions();
+        run(60 * S, true);
+        drain_actions();
+        assert_int_equal(w.n_takes_done, 1);
+        assert_int_equal(w.n_fired, story == 0);
+        assert_int_equal(rig_ledger(w.rig)->state, story == 0 ? TAKE_VERIFIED : TAKE_FAILED);
+        if (story == 0)
+            check_accounts(rig_ledger(w.rig));
+        if (story == 1)
+            assert_string_equal(rig_ledger(w.rig)->reason, "cancelled; the button was not pressed");
+        assert_false(rig_waits_for_button(w.rig));
+        assert_int_equal(capture_as("20261122T090001_d", false)->state, TAKE_VERIFIED); // and the next one is as ever
+        tear_down();
+    }
+}
+
 // Five thousand takes with every fault there is, unattended.
 static void five_thousand_takes_lose_nothing(void **state)
 {
@@ -629,6 +676,7 @@ int main(void)
         cmocka_unit_test(a_take_is_resumed_from_its_ledger),
         cmocka_unit_test(a_take_that_was_never_exposed_says_so),
         cmocka_unit_test(cancelling_before_the_shot_costs_nothing_after_it_no_frame),
+        cmocka_unit_test(armed_it_waits_for_the_button),
         cmocka_unit_test(five_thousand_takes_lose_nothing),
     };
     return cmocka_run_group_tests(tests, NULL, NULL);
