@@ -1,6 +1,7 @@
-// rigd/daemon.c - the loop around the rig: workers, timers, the disk's thread, the trigger, clients, systemd.
+// rigd/daemon.c - the loop around the rig: workers, timers, the disk's threads, the trigger, clients, systemd.
 //
-// One thread does everything but touch the disk; a second one does that, job after job, so that a slow fsync holds up no camera. After
+// One thread does everything but touch the disk; a second one does that, job after job, so that a slow fsync holds up no camera; a third
+// answers what clients ask of takes that are over, so that hashing one of gigabytes (export) holds up no take. After
 // each event the rig's actions are carried out and its next deadline is set (look_at_rig). Decisions are the rig's, not made here.
 #include <systemd/sd-daemon.h>
 #include <systemd/sd-event.h>
@@ -53,7 +54,18 @@ struct worker {
     sd_event_source *io, *child;
 };
 
-// Work for the disk's thread. work runs there and touches nothing but its job; done runs in the loop.
+struct job;
+
+// A thread that touches the disk, and what it is to do.
+struct lane {
+    struct daemon *daemon;
+    struct job *todo;
+    pthread_t thread;
+    pthread_cond_t wake;
+    bool runs, ends;
+};
+
+// Work for one of them. work runs there and touches nothing but its job; done runs in the loop.
 struct job {
     void (*work)(struct job *job);
     void (*done)(struct daemon *d, struct job *job);
@@ -112,13 +124,11 @@ struct daemon {
     struct waiter waiter[WAITERS_MAX];
     char once_take[96];
     // disk
-    pthread_t disk;
-    bool disk_runs;
-    pthread_mutex_t lock;
-    pthread_cond_t wake;
-    struct job *todo, *finished;
-    bool disk_ends;
+    struct lane takes, answers; // what the rig waits for | what clients do
+    pthread_mutex_t lock;       // of the lanes and what is finished
+    struct job *finished;
     int finished_fd;
+    int n_exports;              // under way
 };
 
 static int64_t now_ns(void)
@@ -135,7 +145,7 @@ static int64_t utc_ms(void)
     return (int64_t)t.tv_sec * 1000 + t.tv_nsec / 1000000;
 }
 
-// ---- the disk's thread -----------------------------------------------------------------------------------------------------------
+// ---- the disk's threads ----------------------------------------------------------------------------------------------------------
 
 static void job_free(struct job *j)
 {
@@ -148,23 +158,24 @@ static void job_free(struct job *j)
     free(j);
 }
 
-static struct job *take_job(struct daemon *d, bool wait)
+static struct job *take_job(struct lane *l)
 {
     struct job *j;
-    pthread_mutex_lock(&d->lock);
-    while (wait && !d->todo && !d->disk_ends)
-        pthread_cond_wait(&d->wake, &d->lock);
-    j = d->todo;
+    pthread_mutex_lock(&l->daemon->lock);
+    while (!l->todo && !l->ends)
+        pthread_cond_wait(&l->wake, &l->daemon->lock);
+    j = l->todo;
     if (j)
-        d->todo = j->next;
-    pthread_mutex_unlock(&d->lock);
+        l->todo = j->next;
+    pthread_mutex_unlock(&l->daemon->lock);
     return j;
 }
 
 static void *disk_thread(void *arg)
 {
-    struct daemon *d = arg;
-    for (struct job *j; (j = take_job(d, true));) {
+    struct lane *l = arg;
+    struct daemon *d = l->daemon;
+    for (struct job *j; (j = take_job(l));) {
         const uint64_t one = 1;
         j->next = NULL;
         j->work(j);
@@ -190,15 +201,40 @@ static struct job *new_job(void (*work)(struct job *), void (*done)(struct daemo
     return j;
 }
 
-static void give(struct daemon *d, struct job *j)
+static void give_to(struct lane *l, struct job *j)
 {
-    pthread_mutex_lock(&d->lock);
-    struct job **end = &d->todo;
+    pthread_mutex_lock(&l->daemon->lock);
+    struct job **end = &l->todo;
     while (*end)
         end = &(*end)->next;
     *end = j;
-    pthread_cond_signal(&d->wake);
+    pthread_cond_signal(&l->wake);
+    pthread_mutex_unlock(&l->daemon->lock);
+}
+
+static void give(struct daemon *d, struct job *j)
+{
+    give_to(&d->takes, j);
+}
+
+static int begin_lane(struct daemon *d, struct lane *l)
+{
+    l->daemon = d;
+    pthread_cond_init(&l->wake, NULL);
+    const int err = -pthread_create(&l->thread, NULL, disk_thread, l);
+    l->runs = !err;
+    return err;
+}
+
+static void end_lane(struct daemon *d, struct lane *l)
+{
+    if (!l->runs)
+        return;
+    pthread_mutex_lock(&d->lock);
+    l->ends = true; // after what it has to do
+    pthread_cond_signal(&l->wake);
     pthread_mutex_unlock(&d->lock);
+    pthread_join(l->thread, NULL);
 }
 
 static int on_finished(sd_event_source *source, int fd, uint32_t events, void *arg)
@@ -1149,7 +1185,7 @@ static void ask_metrics(struct daemon *d, uint64_t token, const struct json *req
     control_reply(d->control, token, o);
 }
 
-// Names the newest takes there are. (Folders are listed by the disk's thread.)
+// Names the newest takes there are. (Folders are listed by a thread of the disk.)
 static void work_no_such_take(struct job *j)
 {
     struct dirent **entries = NULL;
@@ -1193,7 +1229,7 @@ static bool take_named(struct daemon *d, uint64_t token, const struct json *requ
     j->token = token;
     snprintf(j->dir, sizeof(j->dir), "%s", d->takes_dir);
     snprintf(j->id, sizeof(j->id), "%s", text);
-    give(d, j);
+    give_to(&d->answers, j);
     return false;
 }
 
@@ -1204,6 +1240,8 @@ static void ask_resume(struct daemon *d, uint64_t token, const struct json *requ
         return;
     if (d->n_unfinished || rig_is_busy(d->rig))
         control_refuse(d->control, token, "busy", "a take is under way; wait for it");
+    else if (d->n_exports) // two writers of one manifest
+        control_refuse(d->control, token, "busy", "a take is being exported; wait for it");
     else if (add_unfinished(d, id))
         d->resume_token = token;
     else
@@ -1266,6 +1304,7 @@ static void work_doctor(struct job *j)
 static void done_answer(struct daemon *d, struct job *j)
 {
     struct json *o = NULL;
+    d->n_exports -= j->work == work_export;
     if (j->err || !j->text || json_parse(&o, j->text, strlen(j->text), NULL))
         control_refuse(d->control, j->token, "failed", j->err ? strerror(-j->err) : "out of memory");
     else
@@ -1287,7 +1326,7 @@ static void ask_takes(struct daemon *d, uint64_t token, const struct json *reque
     int64_t newest = INT_MAX;
     json_get_int(request, "newest", &newest);
     j->newest = newest > 0 && newest < INT_MAX ? (int)newest : INT_MAX;
-    give(d, j);
+    give_to(&d->answers, j);
 }
 
 static void ask_take(struct daemon *d, uint64_t token, const struct json *request, void (*work)(struct job *))
@@ -1297,7 +1336,8 @@ static void ask_take(struct daemon *d, uint64_t token, const struct json *reques
         return;
     struct job *j = answer_job(d, token, work);
     memcpy(j->id, id, sizeof(id));
-    give(d, j);
+    d->n_exports += work == work_export;
+    give_to(&d->answers, j);
 }
 
 static void ask_report(struct daemon *d, uint64_t token, const struct json *request)
@@ -1310,7 +1350,10 @@ static void ask_export(struct daemon *d, uint64_t token, const struct json *requ
     char id[96];
     if (!take_named(d, token, request, id))
         return;
-    if (rig_is_busy(d->rig) && !strcmp(rig_ledger(d->rig) ? rig_ledger(d->rig)->id : "", id))
+    bool is_under_way = rig_is_busy(d->rig) && !strcmp(rig_ledger(d->rig) ? rig_ledger(d->rig)->id : "", id);
+    for (int i = 0; i < d->n_unfinished; i++)
+        is_under_way |= !strcmp(d->unfinished[i], id);
+    if (is_under_way)
         control_refuse(d->control, token, "busy", "this take is under way; wait for it");
     else
         ask_take(d, token, request, work_export);
@@ -1374,7 +1417,7 @@ static void ask_doctor(struct daemon *d, uint64_t token, const struct json *requ
     (void)request;
     struct job *j = answer_job(d, token, work_doctor); // it walks through /proc, and asks the disk
     j->config = &d->config;
-    give(d, j);
+    give_to(&d->answers, j);
 }
 
 static void on_request(void *arg, uint64_t token, const char *what, const struct json *request)
@@ -1673,13 +1716,8 @@ static void tear_down(struct daemon *d)
     end_workers(d);
     sd_event_source_disable_unref(d->trigger_io);
     trigger_close(d->trigger);
-    if (d->disk_runs) {
-        pthread_mutex_lock(&d->lock);
-        d->disk_ends = true; // after what it has to do
-        pthread_cond_signal(&d->wake);
-        pthread_mutex_unlock(&d->lock);
-        pthread_join(d->disk, NULL);
-    }
+    end_lane(d, &d->takes);
+    end_lane(d, &d->answers);
     workshop_close(d->workshop); // what it makes is owed
     for (struct job *j = d->finished; j;) {
         struct job *next = j->next;
@@ -1737,10 +1775,11 @@ static int run(struct daemon *d)
     if (!err)
         err = set_up_loop(d);
     if (!err)
-        err = -pthread_create(&d->disk, NULL, disk_thread, d);
+        err = begin_lane(d, &d->takes);
+    if (!err)
+        err = begin_lane(d, &d->answers);
     if (err)
         return err;
-    d->disk_runs = true;
     web_open(&d->web, &d->config); // without it the rig works all the same
     ledger_remove_leftovers(d->takes_dir);
     find_unfinished(d);
@@ -1758,7 +1797,6 @@ int daemon_run(const struct daemon_options *options)
     if (!d)
         return -ENOMEM;
     pthread_mutex_init(&d->lock, NULL);
-    pthread_cond_init(&d->wake, NULL);
     d->finished_fd = -1;
     d->trigger_word = "not open yet";
     d->once = options->once;
