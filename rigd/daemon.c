@@ -1,6 +1,7 @@
-// rigd/daemon.c - the loop around the rig: workers, timers, the disk's thread, the trigger, clients, systemd.
+// rigd/daemon.c - the loop around the rig: workers, timers, the disk's threads, the trigger, clients, systemd.
 //
-// One thread does everything but touch the disk; a second one does that, job after job, so that a slow fsync holds up no camera. After
+// One thread does everything but touch the disk; a second one does that, job after job, so that a slow fsync holds up no camera; a third
+// answers what clients ask of takes that are over, so that hashing one of gigabytes (export) holds up no take. After
 // each event the rig's actions are carried out and its next deadline is set (look_at_rig). Decisions are the rig's, not made here.
 #include <systemd/sd-daemon.h>
 #include <systemd/sd-event.h>
@@ -53,7 +54,18 @@ struct worker {
     sd_event_source *io, *child;
 };
 
-// Work for the disk's thread. work runs there and touches nothing but its job; done runs in the loop.
+struct job;
+
+// A thread that touches the disk, and what it is to do.
+struct lane {
+    struct daemon *daemon;
+    struct job *todo;
+    pthread_t thread;
+    pthread_cond_t wake;
+    bool runs, ends;
+};
+
+// Work for one of them. work runs there and touches nothing but its job; done runs in the loop.
 struct job {
     void (*work)(struct job *job);
     void (*done)(struct daemon *d, struct job *job);
@@ -112,13 +124,11 @@ struct daemon {
     struct waiter waiter[WAITERS_MAX];
     char once_take[96];
     // disk
-    pthread_t disk;
-    bool disk_runs;
-    pthread_mutex_t lock;
-    pthread_cond_t wake;
-    struct job *todo, *finished;
-    bool disk_ends;
+    struct lane takes, answers; // what the rig waits for | what clients do
+    pthread_mutex_t lock;       // of the lanes and what is finished
+    struct job *finished;
     int finished_fd;
+    int n_exports;              // under way
 };
 
 static int64_t now_ns(void)
@@ -135,7 +145,7 @@ static int64_t utc_ms(void)
     return (int64_t)t.tv_sec * 1000 + t.tv_nsec / 1000000;
 }
 
-// ---- the disk's thread -----------------------------------------------------------------------------------------------------------
+// ---- the disk's threads ----------------------------------------------------------------------------------------------------------
 
 static void job_free(struct job *j)
 {
@@ -148,23 +158,24 @@ static void job_free(struct job *j)
     free(j);
 }
 
-static struct job *take_job(struct daemon *d, bool wait)
+static struct job *take_job(struct lane *l)
 {
     struct job *j;
-    pthread_mutex_lock(&d->lock);
-    while (wait && !d->todo && !d->disk_ends)
-        pthread_cond_wait(&d->wake, &d->lock);
-    j = d->todo;
+    pthread_mutex_lock(&l->daemon->lock);
+    while (!l->todo && !l->ends)
+        pthread_cond_wait(&l->wake, &l->daemon->lock);
+    j = l->todo;
     if (j)
-        d->todo = j->next;
-    pthread_mutex_unlock(&d->lock);
+        l->todo = j->next;
+    pthread_mutex_unlock(&l->daemon->lock);
     return j;
 }
 
 static void *disk_thread(void *arg)
 {
-    struct daemon *d = arg;
-    for (struct job *j; (j = take_job(d, true));) {
+    struct lane *l = arg;
+    struct daemon *d = l->daemon;
+    for (struct job *j; (j = take_job(l));) {
         const uint64_t one = 1;
         j->next = NULL;
         j->work(j);
@@ -190,15 +201,40 @@ static struct job *new_job(void (*work)(struct job *), void (*done)(struct daemo
     return j;
 }
 
-static void give(struct daemon *d, struct job *j)
+static void give_to(struct lane *l, struct job *j)
 {
-    pthread_mutex_lock(&d->lock);
-    struct job **end = &d->todo;
+    pthread_mutex_lock(&l->daemon->lock);
+    struct job **end = &l->todo;
     while (*end)
         end = &(*end)->next;
     *end = j;
-    pthread_cond_signal(&d->wake);
+    pthread_cond_signal(&l->wake);
+    pthread_mutex_unlock(&l->daemon->lock);
+}
+
+static void give(struct daemon *d, struct job *j)
+{
+    give_to(&d->takes, j);
+}
+
+static int begin_lane(struct daemon *d, struct lane *l)
+{
+    l->daemon = d;
+    pthread_cond_init(&l->wake, NULL);
+    const int err = -pthread_create(&l->thread, NULL, disk_thread, l);
+    l->runs = !err;
+    return err;
+}
+
+static void end_lane(struct daemon *d, struct lane *l)
+{
+    if (!l->runs)
+        return;
+    pthread_mutex_lock(&d->lock);
+    l->ends = true; // after what it has to do
+    pthread_cond_signal(&l->wake);
     pthread_mutex_unlock(&d->lock);
+    pthread_join(l->thread, NULL);
 }
 
 static int on_finished(sd_event_source *source, int fd, uint32_t events, void *arg)
@@ -566,13 +602,17 @@ static void fire(struct daemon *d, const struct trigger_shot *shot)
 
 // ---- takes ---------------------------------------------------------------------------------------------------------------------------------
 
-static int begin_take(struct daemon *d, enum ledger_kind kind, const char *name, bool without_missing, char *why)
+static int begin_take(struct daemon *d, enum ledger_kind kind, const char *name, bool without_missing, bool on_button, char *why)
 {
     char plain[41], id[96], created[40], stamp[40];
     const int64_t utc = utc_ms();
     const time_t t = (time_t)(utc / 1000);
     struct tm tm;
     size_t n = 0;
+    if (d->n_unfinished) { // whoever asks, the button too: its ledger is being read, and the next take done is that one
+        snprintf(why, 200, "an unfinished take is being collected; wait for it");
+        return -EBUSY;
+    }
     for (; name[n] && n < sizeof(plain) - 1; n++)
         plain[n] = isalnum((unsigned char)name[n]) && (unsigned char)name[n] < 0x80 ? name[n] : '-';
     plain[n] = 0;
@@ -581,7 +621,7 @@ static int begin_take(struct daemon *d, enum ledger_kind kind, const char *name,
     strftime(stamp, sizeof(stamp), "%Y%m%dT%H%M%S", &tm);
     snprintf(id, sizeof(id), "%s%03d_%s", stamp, (int)(utc % 1000), plain);
     const struct rig_take take = { .id = id, .name = plain, .created = created, .utc_ms = utc, .takes_dir = d->takes_dir,
-                                   .panorama_take = kind == LEDGER_CAPTURE ? d->panorama_take : NULL };
+                                   .panorama_take = kind == LEDGER_CAPTURE ? d->panorama_take : NULL, .on_button = on_button };
     const int err = kind == LEDGER_PANORAMA ? rig_panorama(d->rig, now_ns(), &take, why) : rig_capture(d->rig, now_ns(), &take, without_missing, why);
     if (!err)
         d->take_began_ns = now_ns();
@@ -590,7 +630,7 @@ static int begin_take(struct daemon *d, enum ledger_kind kind, const char *name,
 
 static int capture(struct daemon *d, const char *name, bool without_missing, char *why)
 {
-    return begin_take(d, LEDGER_CAPTURE, name, without_missing, why);
+    return begin_take(d, LEDGER_CAPTURE, name, without_missing, false, why);
 }
 
 // Ids begin with their time.
@@ -917,6 +957,10 @@ static void on_added(void *arg, uint64_t token, const char *take, int err, const
             if (err)
                 d->waiter[i].token = 0;
         }
+    if (err && d->once && !strcmp(d->once_take, take)) { // nothing else will end it
+        d->exit_code = 1;
+        sd_event_exit(d->event, 0);
+    }
     if (err && !token)
         log_error("take %s: cannot be processed: %s", take, why[0] ? why : strerror(-err));
     else if (err)
@@ -943,13 +987,12 @@ static void refuse(struct daemon *d, uint64_t token, int err, const char *why)
 static void ask_capture(struct daemon *d, uint64_t token, const struct json *request)
 {
     const char *name = "take";
-    bool without_missing = false;
+    bool without_missing = false, on_button = false;
     char why[200];
     json_get_string(request, "name", &name);
     json_get_bool(request, "without_missing", &without_missing);
-    const int err = d->n_unfinished ? -EBUSY : capture(d, name, without_missing, why);
-    if (d->n_unfinished)
-        snprintf(why, sizeof(why), "an unfinished take is being collected; wait for it");
+    json_get_bool(request, "on_button", &on_button);
+    const int err = begin_take(d, LEDGER_CAPTURE, name, without_missing, on_button, why);
     if (err)
         refuse(d, token, err, why);
     else
@@ -961,9 +1004,7 @@ static void ask_panorama(struct daemon *d, uint64_t token, const struct json *re
     const char *name = "panorama";
     char why[200];
     json_get_string(request, "name", &name);
-    const int err = d->n_unfinished ? -EBUSY : begin_take(d, LEDGER_PANORAMA, name, false, why);
-    if (d->n_unfinished)
-        snprintf(why, sizeof(why), "an unfinished take is being collected; wait for it");
+    const int err = begin_take(d, LEDGER_PANORAMA, name, false, false, why);
     if (err)
         refuse(d, token, err, why);
     else
@@ -1109,12 +1150,17 @@ static struct json *describe_all_but_cameras(struct daemon *d)
     char refusal[160] = "";
     if (d->n_unfinished)
         snprintf(refusal, sizeof(refusal), "an unfinished take is being collected; wait for it");
+    else if (rig_waits_for_button(d->rig))
+        snprintf(refusal, sizeof(refusal), "armed: the trigger's button fires; cancel (rigctl cancel) disarms");
     else if (rig_is_busy(d->rig))
         snprintf(refusal, sizeof(refusal), "the rig is busy (%s); wait for it", take_state_name(rig_state(d->rig)));
     else if (!d->trigger)
         snprintf(refusal, sizeof(refusal), "the trigger is %s: check its cable and power; rigctl doctor says more", d->trigger_word);
     if (refusal[0])
         json_set_string(o, "refusal", refusal);
+    if (d->trigger && (trigger_abilities(d->trigger) & TRIGGER_BUTTON)) // what pressing it would do now
+        json_set_string(o, "button", rig_waits_for_button(d->rig) ? "fires" : refusal[0] ? "refused" : "takes");
+    json_set_bool(o, "can_arm", d->trigger && (trigger_abilities(d->trigger) & TRIGGER_WAITS));
     json_set(o, "processing", workshop_describe_all(d->workshop));
     if (d->web)
         json_set_string(o, "page", web_address(d->web));
@@ -1139,7 +1185,7 @@ static void ask_metrics(struct daemon *d, uint64_t token, const struct json *req
     control_reply(d->control, token, o);
 }
 
-// Names the newest takes there are. (Folders are listed by the disk's thread.)
+// Names the newest takes there are. (Folders are listed by a thread of the disk.)
 static void work_no_such_take(struct job *j)
 {
     struct dirent **entries = NULL;
@@ -1183,7 +1229,7 @@ static bool take_named(struct daemon *d, uint64_t token, const struct json *requ
     j->token = token;
     snprintf(j->dir, sizeof(j->dir), "%s", d->takes_dir);
     snprintf(j->id, sizeof(j->id), "%s", text);
-    give(d, j);
+    give_to(&d->answers, j);
     return false;
 }
 
@@ -1194,6 +1240,8 @@ static void ask_resume(struct daemon *d, uint64_t token, const struct json *requ
         return;
     if (d->n_unfinished || rig_is_busy(d->rig))
         control_refuse(d->control, token, "busy", "a take is under way; wait for it");
+    else if (d->n_exports) // two writers of one manifest
+        control_refuse(d->control, token, "busy", "a take is being exported; wait for it");
     else if (add_unfinished(d, id))
         d->resume_token = token;
     else
@@ -1256,6 +1304,7 @@ static void work_doctor(struct job *j)
 static void done_answer(struct daemon *d, struct job *j)
 {
     struct json *o = NULL;
+    d->n_exports -= j->work == work_export;
     if (j->err || !j->text || json_parse(&o, j->text, strlen(j->text), NULL))
         control_refuse(d->control, j->token, "failed", j->err ? strerror(-j->err) : "out of memory");
     else
@@ -1277,7 +1326,7 @@ static void ask_takes(struct daemon *d, uint64_t token, const struct json *reque
     int64_t newest = INT_MAX;
     json_get_int(request, "newest", &newest);
     j->newest = newest > 0 && newest < INT_MAX ? (int)newest : INT_MAX;
-    give(d, j);
+    give_to(&d->answers, j);
 }
 
 static void ask_take(struct daemon *d, uint64_t token, const struct json *request, void (*work)(struct job *))
@@ -1287,7 +1336,8 @@ static void ask_take(struct daemon *d, uint64_t token, const struct json *reques
         return;
     struct job *j = answer_job(d, token, work);
     memcpy(j->id, id, sizeof(id));
-    give(d, j);
+    d->n_exports += work == work_export;
+    give_to(&d->answers, j);
 }
 
 static void ask_report(struct daemon *d, uint64_t token, const struct json *request)
@@ -1300,7 +1350,10 @@ static void ask_export(struct daemon *d, uint64_t token, const struct json *requ
     char id[96];
     if (!take_named(d, token, request, id))
         return;
-    if (rig_is_busy(d->rig) && !strcmp(rig_ledger(d->rig) ? rig_ledger(d->rig)->id : "", id))
+    bool is_under_way = rig_is_busy(d->rig) && !strcmp(rig_ledger(d->rig) ? rig_ledger(d->rig)->id : "", id);
+    for (int i = 0; i < d->n_unfinished; i++)
+        is_under_way |= !strcmp(d->unfinished[i], id);
+    if (is_under_way)
         control_refuse(d->control, token, "busy", "this take is under way; wait for it");
     else
         ask_take(d, token, request, work_export);
@@ -1364,7 +1417,7 @@ static void ask_doctor(struct daemon *d, uint64_t token, const struct json *requ
     (void)request;
     struct job *j = answer_job(d, token, work_doctor); // it walks through /proc, and asks the disk
     j->config = &d->config;
-    give(d, j);
+    give_to(&d->answers, j);
 }
 
 static void on_request(void *arg, uint64_t token, const char *what, const struct json *request)
@@ -1663,13 +1716,8 @@ static void tear_down(struct daemon *d)
     end_workers(d);
     sd_event_source_disable_unref(d->trigger_io);
     trigger_close(d->trigger);
-    if (d->disk_runs) {
-        pthread_mutex_lock(&d->lock);
-        d->disk_ends = true; // after what it has to do
-        pthread_cond_signal(&d->wake);
-        pthread_mutex_unlock(&d->lock);
-        pthread_join(d->disk, NULL);
-    }
+    end_lane(d, &d->takes);
+    end_lane(d, &d->answers);
     workshop_close(d->workshop); // what it makes is owed
     for (struct job *j = d->finished; j;) {
         struct job *next = j->next;
@@ -1727,10 +1775,11 @@ static int run(struct daemon *d)
     if (!err)
         err = set_up_loop(d);
     if (!err)
-        err = -pthread_create(&d->disk, NULL, disk_thread, d);
+        err = begin_lane(d, &d->takes);
+    if (!err)
+        err = begin_lane(d, &d->answers);
     if (err)
         return err;
-    d->disk_runs = true;
     web_open(&d->web, &d->config); // without it the rig works all the same
     ledger_remove_leftovers(d->takes_dir);
     find_unfinished(d);
@@ -1748,7 +1797,6 @@ int daemon_run(const struct daemon_options *options)
     if (!d)
         return -ENOMEM;
     pthread_mutex_init(&d->lock, NULL);
-    pthread_cond_init(&d->wake, NULL);
     d->finished_fd = -1;
     d->trigger_word = "not open yet";
     d->once = options->once;

@@ -171,10 +171,8 @@ __attribute__((noreturn)) static void keep(const struct executor_command *c, cha
         if (s == SIGTERM) {
             kill(-pid, SIGTERM);
             kill(-pid, SIGCONT);
-        } else if (s == SIGUSR1) {
-            kill(-pid, SIGSTOP);
-        } else if (s == SIGUSR2) {
-            kill(-pid, SIGCONT);
+        } else if (s == SIGRTMIN) {
+            kill(-pid, info.si_value.sival_int);
         } else if (s == SIGHUP || s == SIGQUIT || s == SIGINT) {
             kill(-pid, SIGKILL);
         } else if (s == SIGCHLD) {
@@ -319,9 +317,13 @@ int executor_start(struct executor *e, const struct executor_command *c)
 
 void executor_signal(struct executor *e, int job, enum executor_signal s)
 {
-    static const int signals[] = { SIGTERM, SIGQUIT, SIGUSR1, SIGUSR2 }; // the keeper's language
-    if (job >= 0 && job < EXECUTOR_JOBS_MAX && e->job[job])
-        kill(e->job[job]->keeper, signals[s]);
+    if (job < 0 || job >= EXECUTOR_JOBS_MAX || !e->job[job])
+        return;
+    const pid_t keeper = e->job[job]->keeper; // TERM and QUIT are its language; the others are queued: the last one asked for is what holds
+    if (s == EXECUTOR_TERM || s == EXECUTOR_KILL)
+        kill(keeper, s == EXECUTOR_TERM ? SIGTERM : SIGQUIT);
+    else if (sigqueue(keeper, SIGRTMIN, (union sigval){ .sival_int = s == EXECUTOR_PAUSE ? SIGSTOP : SIGCONT }))
+        log_error("executor: job %d cannot be %s: %s; raise the limit of pending signals (ulimit -i)", job, s == EXECUTOR_PAUSE ? "paused" : "continued", strerror(errno));
 }
 
 // ---- hearing ------------------------------------------------------------------------------------------------------------------

@@ -499,6 +499,8 @@ static void get_stops(struct reader *r, struct ledger *l)
     if (json_get(r->v, "kind"))
         l->kind = get_word(r, "kind", kind_names, LEDGER_N_KINDS);
     get_string(r, "panorama_take", l->panorama_take, sizeof(l->panorama_take));
+    if (l->panorama_take[0] && !is_plain(l->panorama_take)) // it becomes a path
+        complain(r, "panorama_take", "the name of a take's folder");
     if (l->kind != LEDGER_PANORAMA)
         return;
     l->n_stops = get_length(r, "stops", CONFIG_STOPS_MAX);

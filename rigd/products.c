@@ -454,7 +454,8 @@ static void look_at_develop(struct look *l)
             say(item->text, "it delivered no raw file; set imageformat = raw in [settings]");
             continue;
         }
-        item->memory_bytes = 16 * raw->object.size_bytes + (64 << 20); // two frames of floats and the file
+        const int64_t raw_bytes = raw->object.size_bytes < INT64_C(1) << 40 ? raw->object.size_bytes : INT64_C(1) << 40; // take.json may say anything
+        item->memory_bytes = 16 * raw_bytes + (64 << 20); // two frames of floats and the file
         snprintf(j->raw, sizeof(j->raw), "%s", raw->file);
         snprintf(j->out, sizeof(j->out), "linear/%s.exr", k->name);
         struct key key = key_begin("develop");

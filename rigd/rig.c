@@ -205,6 +205,8 @@ int64_t rig_deadline_ns(const struct rig *r)
             due = sooner(due, b->heartbeat_ns);
         if (b->condition == RIG_RECOVERING)
             due = sooner(due, b->trouble_ns + TROUBLE_MS * MS);
+        if (b->condition == RIG_RECOVERING && b->start_ns && !b->worker)
+            due = sooner(due, b->start_ns);
         if (b->condition == RIG_QUARANTINED && r->phase == PHASE_IDLE && !b->worker)
             due = sooner(due, b->again_ns);
     }
@@ -322,12 +324,17 @@ int rig_capture(struct rig *r, int64_t now, const struct rig_take *take, bool wi
     const int err = rig_may_begin(r, true, why);
     if (err)
         return err;
+    if (take->on_button && !(r->abilities & TRIGGER_WAITS)) {
+        snprintf(why, 200, "this trigger has no button that fires by itself; a trigger board ([trigger] kind = usb) has");
+        return -EINVAL;
+    }
     rig_new_ledger(r);
     ledger_init(&r->ledger, r->config);
     if (!r->ledger.camera)
         abort();
     rig_name_take(r, now, take);
     r->without_missing = without_missing;
+    r->on_button = take->on_button;
     r->purpose = FOR_TAKE;
     rig_set_state(r, TAKE_PREFLIGHT);
     rig_begin_preflight(r, now);
@@ -497,7 +504,7 @@ int rig_identify(struct rig *r, int64_t now, int i, char *why)
         snprintf(why, 200, "%s", r->phase != PHASE_IDLE ? "a take is under way; wait for it" : "this camera does not answer");
         return -EBUSY;
     }
-    r->body[i].identify = true;
+    r->body[i].identify = r->body[i].identifying = true;
     rig_pump(r, i, now);
     return 0;
 }
@@ -513,7 +520,7 @@ int rig_reinstate(struct rig *r, int64_t now, int i, char *why)
         return 0;
     b->condition = RIG_RECOVERING;
     b->trouble_ns = now;
-    b->rung = 0;
+    b->rung = b->n_starts = 0;
     b->suspect = CAMERA_OPEN;
     if (!b->worker)
         rig_start_worker(r, i, now); // else it is being killed: its end starts the next
@@ -639,6 +646,11 @@ enum take_state rig_state(const struct rig *r)
     if (r->purpose == FOR_TAKE || r->purpose == FOR_RESUME || r->purpose == FOR_PANORAMA)
         return r->ledger.state;
     return r->phase == PHASE_PREFLIGHT ? TAKE_PREFLIGHT : r->phase == PHASE_COLLECT ? TAKE_COLLECTING : r->phase == PHASE_ARM ? TAKE_ARMED : TAKE_EXPOSING;
+}
+
+bool rig_waits_for_button(const struct rig *r)
+{
+    return r->phase == PHASE_FIRE && r->purpose == FOR_TAKE && r->on_button;
 }
 
 bool rig_is_busy(const struct rig *r)

@@ -97,6 +97,7 @@ struct rig_take {
     int64_t utc_ms;
     const char *takes_dir;
     const char *panorama_take; // capture: the newest panorama there is; NULL
+    bool on_button;            // capture: armed, then the trigger itself fires when its button is pressed (TRIGGER_WAITS; -EINVAL without)
 };
 int rig_capture(struct rig *rig, int64_t now_ns, const struct rig_take *take, bool without_missing, char *why);
 // A take of kind panorama: for each stop the head turns (or a person turns it: RIG_PROMPT), then the panorama camera alone is exposed as
@@ -112,7 +113,7 @@ int rig_calibrate(struct rig *rig, int64_t now_ns, int n_shots, char *why);
 int rig_resume(struct rig *rig, int64_t now_ns, struct ledger *ledger, const char *takes_dir, bool attended, char *why);
 int rig_identify(struct rig *rig, int64_t now_ns, int camera, char *why);
 int rig_reinstate(struct rig *rig, int64_t now_ns, int camera, char *why); // out of quarantine, or anew
-int rig_cancel(struct rig *rig, int64_t now_ns, char *why); // before the shutters are pressed; later the frames are collected all the same
+int rig_cancel(struct rig *rig, int64_t now_ns, char *why); // before the shutters are pressed, also while the button is waited for; later the frames are collected all the same
 void rig_stop(struct rig *rig, int64_t now_ns); // release the trigger, close the cameras; a take under way stays resumable
 
 // ---- what is to be seen --------------------------------------------------------------------------------------------------
@@ -141,6 +142,7 @@ enum take_state rig_state(const struct rig *rig); // of the take under way, TAKE
 const char *rig_outcome(const struct rig *rig);   // why the last take, preflight or calibration failed; "": it did not
 const char *rig_prompt(const struct rig *rig);    // what a person is asked to do; "": nothing
 bool rig_is_busy(const struct rig *rig);          // capture would be refused
+bool rig_waits_for_button(const struct rig *rig); // armed: the next press fires, with no decision of this host in between
 const struct ledger *rig_ledger(const struct rig *rig); // of the take under way or the last one; NULL: none yet
 void rig_set_lag(struct rig *rig, const struct lag *lag); // as read from lag.json
 const char *rig_condition_name(enum rig_condition c);

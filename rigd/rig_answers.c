@@ -166,7 +166,7 @@ static void done(struct rig *r, int i, int64_t now, const struct camera_event *e
         rig_changed(r);
         break;
     case CAMERA_IDENTIFY:
-        rig_act(r, RIG_IDENTIFIED, i);
+        rig_identified(r, i, "");
         break;
     case CAMERA_CLOSE:
     case CAMERA_N_COMMANDS:
@@ -184,6 +184,8 @@ static void busy(struct rig *r, int i, int64_t now, const struct camera_event *e
     }
     if (e->command == CAMERA_TRIGGER)
         b->press = true;
+    if (e->command == CAMERA_IDENTIFY)
+        b->identify = true;
     const int64_t wait = (INT64_C(50) << (b->n_busy < 5 ? b->n_busy : 5)) * MS;
     b->n_busy++;
     if (now + wait - b->busy_since_ns > BUSY_MS * MS) {
@@ -209,7 +211,7 @@ static void failed_softly(struct rig *r, int i, int64_t now, const struct camera
         b->thumbed = true; // a preview is not worth a second try
         return;
     case CAMERA_IDENTIFY:
-        snprintf(rig_act(r, RIG_IDENTIFIED, i)->text, sizeof(why), "%.199s", why);
+        rig_identified(r, i, why);
         return;
     case CAMERA_TRIGGER: // it may have fired all the same: the card will tell
         rig_say(r, RIG_WARNING, i, "%s", why);

@@ -367,8 +367,19 @@ void rig_start_worker(struct rig *r, int i, int64_t now)
     struct body *b = &r->body[i];
     b->worker = true;
     b->greeted = false;
+    b->start_ns = 0;
     b->greet_due_ns = now + GREETING_MS * MS;
     rig_act(r, RIG_SPAWN, i);
+}
+
+// A worker that cannot be started, or dies at once, is not started over and over: the loop would do nothing else.
+static void start_again(struct rig *r, int i, int64_t now)
+{
+    struct body *b = &r->body[i];
+    if (b->n_starts++ < STARTS_AT_ONCE)
+        rig_start_worker(r, i, now);
+    else
+        b->start_ns = now + REOPEN_MS * MS;
 }
 
 void rig_kill_worker(struct rig *r, int i)
@@ -396,6 +407,16 @@ void rig_start_more(struct rig *r, int64_t now)
         }
 }
 
+void rig_identified(struct rig *r, int i, const char *why)
+{
+    struct body *b = &r->body[i];
+    if (!b->identifying)
+        return;
+    b->identify = b->identifying = false;
+    struct rig_action *a = rig_act(r, RIG_IDENTIFIED, i);
+    snprintf(a->text, sizeof(a->text), "%.199s", why);
+}
+
 void rig_restore_supply(struct rig *r, int i)
 {
     struct body *b = &r->body[i];
@@ -418,7 +439,8 @@ void rig_quarantine(struct rig *r, int i, int64_t now, const char *why)
     b->again_ns = now + QUARANTINE_MS * MS;
     b->trouble_ns = 0;
     b->rung = 0;
-    b->retry_ns = 0;
+    b->retry_ns = b->start_ns = 0;
+    rig_identified(r, i, b->note);
     if (!known)
         rig_say(r, RIG_ERROR, i, "quarantined: %s", b->note);
     rig_give_up(r, i, b->note);
@@ -433,7 +455,7 @@ static void climb(struct rig *r, int i, int64_t now)
     rig_start_more(r, now); // its place at the start is free
     if (rig_is_silent(r)) { // its worker may come again, its port and its supply are left alone: its shutter may be open
         if (!b->worker)
-            rig_start_worker(r, i, now);
+            start_again(r, i, now);
         return;
     }
     b->rung++;
@@ -465,7 +487,7 @@ static void climb(struct rig *r, int i, int64_t now)
         b->retry_ns = now + REOPEN_MS * MS;
     }
     if (!b->worker)
-        rig_start_worker(r, i, now);
+        start_again(r, i, now);
     rig_pump(r, i, now);
 }
 
@@ -477,6 +499,7 @@ void rig_trouble(struct rig *r, int i, int64_t now, int64_t since, enum camera_c
         return;
     snprintf(b->note, sizeof(b->note), "%.199s", text);
     b->busy_since_ns = 0;
+    rig_identified(r, i, b->note);
     if (suspect == CAMERA_THUMBNAIL)
         b->thumbed = true; // a preview is not worth a second crash
     if (suspect == CAMERA_THUMBNAIL || suspect == CAMERA_IDENTIFY || suspect == CAMERA_TRIGGER)
@@ -488,7 +511,7 @@ void rig_trouble(struct rig *r, int i, int64_t now, int64_t since, enum camera_c
     }
     if (!b->trouble_ns) {
         b->trouble_ns = since > now - SILENCE_MS * MS ? since : now - SILENCE_MS * MS;
-        b->rung = 0;
+        b->rung = b->n_starts = 0;
         b->suspect = suspect;
         b->n_recoveries++;
         rig_say(r, RIG_WARNING, i, "%s; recovering", b->note);
@@ -535,9 +558,12 @@ void rig_body_time(struct rig *r, int i, int64_t now)
         rig_restore_supply(r, i);
         b->retry_ns = now + (relay ? RELAY_ON_MS : POWER_ON_MS) * MS;
     }
+    if (b->condition == RIG_RECOVERING && b->start_ns && now >= b->start_ns && !b->worker)
+        rig_start_worker(r, i, now);
     if (b->condition == RIG_QUARANTINED && r->phase == PHASE_IDLE && !b->worker && now >= b->again_ns) {
         b->condition = RIG_RECOVERING;
         b->trouble_ns = now;
+        b->n_starts = 0;
         b->rung = 1; // the next one resets its port
         b->suspect = CAMERA_OPEN;
         rig_start_worker(r, i, now);

@@ -15,6 +15,7 @@ enum {
     SILENCE_MS = 4000,        // when the command was sent that failed, but at most so long before it did: drivers wait 3 s for an answer
     POWER_OFF_MS = 1500, POWER_ON_MS = 2000, RELAY_OFF_MS = 2000, RELAY_ON_MS = 2500,
     REOPEN_MS = 1000,         // between tries when the ladder has no rung left
+    STARTS_AT_ONCE = 5,       // of a worker in one trouble: a rung each; then REOPEN_MS between them
     QUARANTINE_MS = 60000,    // between tries from quarantine
     DRAIN_QUIET_MS = 200,
     ADJUST_QUIET_MS = 50,     // between exposures of a panorama: this camera was drained, and has only been listened to since
@@ -51,6 +52,8 @@ struct body {
         int64_t due_ns, limit_ns;   // due moves on with PROGRESS, the limit does not
     } flight;
     uint32_t seq;
+    int n_starts;       // of its worker, in this trouble
+    int64_t start_ns;   // 0, or when its worker is to be started again
     int64_t greet_due_ns, retry_ns, busy_since_ns, heartbeat_ns;
     int n_busy, n_failed;
 
@@ -63,7 +66,7 @@ struct body {
 
     bool part;       // of the take under way
     enum step step;
-    bool identify, press, thumbed;
+    bool identify, identifying, press, thumbed; // identifying: somebody waits for RIG_IDENTIFIED
     int64_t owed_due_ns; // RECONCILE: miss it after
     bool saw_nothing;    // RECONCILE: the card was listed and holds nothing new
     struct camera_object cursor[CAMERA_STORES_MAX];
@@ -91,7 +94,7 @@ struct rig {
     enum purpose purpose;
     int64_t phase_due_ns;
     int n_pending, n_wanted; // bodies with a step | that the take wants
-    bool cancelled, without_missing;
+    bool cancelled, without_missing, on_button;
     char outcome[200]; // why the last take, preflight or calibration failed; "" it did not
     bool created; // the take's folder is there
     bool has_ledger;
@@ -169,6 +172,7 @@ void rig_pump_all(struct rig *r, int64_t now);
 void rig_start_worker(struct rig *r, int i, int64_t now);
 void rig_kill_worker(struct rig *r, int i);
 void rig_start_more(struct rig *r, int64_t now);
+void rig_identified(struct rig *r, int i, const char *why); // why "": it was
 void rig_restore_supply(struct rig *r, int i);
 void rig_quarantine(struct rig *r, int i, int64_t now, const char *why);
 void rig_trouble(struct rig *r, int i, int64_t now, int64_t since, enum camera_command_kind suspect, const char *text);

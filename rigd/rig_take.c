@@ -268,6 +268,11 @@ void rig_begin_fire(struct rig *r, int64_t now)
     r->at_ns = now + (FIRE_LEAD_MS + (int64_t)half_ms) * MS;
     *shot = (struct trigger_shot){ .at_ns = r->at_ns, .half_ms = half_ms, .hold_ms = t->hold_ms, .delay_us = r->delay_us, .skip = r->skip };
     r->phase_due_ns = r->at_ns + MAX_DELAY_US * 1000 + (t->hold_ms + 2000) * MS;
+    if (rig_waits_for_button(r)) {
+        shot->on_button = true;
+        r->phase_due_ns = INT64_MAX; // until it is pressed, somebody cancels, or the link breaks: the trigger says each
+        rig_say(r, RIG_INFO, CONFIG_NONE, "take %s: armed; the button fires", r->ledger.id);
+    }
 }
 
 void rig_begin_collect(struct rig *r, int64_t now)
@@ -427,6 +432,8 @@ void rig_fired(struct rig *r, int64_t now, int err, int64_t pressed_ns, int64_t 
     const bool refused = err == -ETIME || err == -EBUSY || err == -EINVAL || err == -ENODEV;
     if (err == -ETIME && ++r->n_fire_tries < FIRE_TRIES_MAX) {
         rig_begin_fire(r, now);
+    } else if (err == -ECANCELED && !pressed_ns && rig_waits_for_button(r)) {
+        rig_fail_take(r, now, "cancelled; the button was not pressed");
     } else if (refused) {
         rig_fail_take(r, now, "the trigger refused the shot: %s; no shutter was pressed", strerror(-err));
     } else {

@@ -18,12 +18,12 @@
 #include <termios.h>
 #include <unistd.h>
 
-enum { EXIT_DONE = 0, EXIT_FAILED = 1, EXIT_USAGE = 2, LINE_MAX_BYTES = 64 << 20, OPTION_OPEN = 256, OPTION_MERGE };
+enum { EXIT_DONE = 0, EXIT_FAILED = 1, EXIT_USAGE = 2, LINE_MAX_BYTES = 64 << 20, OPTION_OPEN = 256, OPTION_MERGE, OPTION_ON_BUTTON };
 
 struct arguments {
     const char *socket_path, *name, *again, *merge, *output, *word[3];
     int n_words, shots;
-    bool json, watch, without_missing, cancel, open;
+    bool json, watch, without_missing, on_button, cancel, open;
     int (*without_daemon)(int argc, char **argv, bool json); // with the words from rest on
     char **rest;
     int n_rest;
@@ -325,6 +325,9 @@ static void print_status(const struct json *s)
         printf("==> %s\n", text_of(s, "prompt"));
     if (text_of(s, "refusal")[0])
         printf("a take would be refused: %s\n", text_of(s, "refusal"));
+    const char *button = text_of(s, "button");
+    if (button[0])
+        printf("button: %s\n", !strcmp(button, "fires") ? "armed, a press fires at once" : !strcmp(button, "takes") ? "a press begins a take: preflight, then the shot" : "a press is refused");
     if (text_of(s, "page")[0])
         printf("page: %s\n", text_of(s, "page"));
     printf("%-10s %-12s %-11s %-12s %-20s %5s %6s %8s  %s\n", "camera", "condition", "doing", "serial", "model", "batt", "free", "lag ms", "note");
@@ -433,7 +436,8 @@ static int take_result(const struct arguments *a, struct json *request)
     const int err = ask_and_print(a, request, true, print_take, &answer);
     if (err)
         return err;
-    const bool good = !strcmp(text_of(answer, "result.state"), "verified");
+    const char *state = text_of(answer, "result.state"); // one that is resumed may have come further before
+    const bool good = !strcmp(state, "verified") || !strcmp(state, "developed") || !strcmp(state, "solved");
     json_free(answer);
     return good ? EXIT_DONE : EXIT_FAILED;
 }
@@ -443,6 +447,7 @@ static int capture(const struct arguments *a)
     struct json *r = request_of("capture");
     json_set_string(r, "name", a->name ? a->name : "take");
     json_set_bool(r, "without_missing", a->without_missing);
+    json_set_bool(r, "on_button", a->on_button);
     return take_result(a, r);
 }
 
@@ -753,7 +758,7 @@ static const struct {
     { "status", NULL, status, "the rig and each camera; --watch: live" },
     { "doctor", NULL, doctor, "what in this machine will fail before it fails" },
     { "preflight", NULL, preflight, "are all cameras fit for a take?" },
-    { "capture", NULL, capture, "make a take; --name, --without-missing" },
+    { "capture", NULL, capture, "make a take; --name, --without-missing, --on-button" },
     { "panorama", NULL, panorama, "shoot the lights as an HDR panorama; --name; or --merge PLAN|TAKE -o FILE: without a daemon" },
     { "continue", NULL, go_on, "what the panorama asked you to do is done" },
     { "cancel", NULL, cancel, "stop a take; after the shot its frames are fetched all the same" },
@@ -782,6 +787,7 @@ static const struct argp_option option_list[] = {
     { "merge", OPTION_MERGE, "PLAN|TAKE", 0, "panorama: make FILE of one that was shot before", 0 },
     { "output", 'o', "FILE", 0, "panorama --merge: the EXR", 0 },
     { "without-missing", 'm', NULL, 0, "capture: leave cameras out that are not fit", 0 },
+    { "on-button", OPTION_ON_BUTTON, NULL, 0, "capture: get ready, then let the trigger board fire by itself when its button is pressed; rigctl cancel disarms", 0 },
     { "shots", 'k', "N", 0, "calibrate: how many (rigd.conf's)", 0 },
     { 0 },
 };
@@ -819,6 +825,9 @@ static error_t parse(int key, char *arg, struct argp_state *state)
         return 0;
     case 'm':
         a->without_missing = true;
+        return 0;
+    case OPTION_ON_BUTTON:
+        a->on_button = true;
         return 0;
     case 'k':
         a->shots = atoi(arg);

@@ -260,19 +260,26 @@ static enum MHD_Result answer_request(struct web *w, struct MHD_Connection *conn
     char *answer = NULL;
     if (!count(w, &w->n_asking, 1, WEB_ASKING_MAX))
         return say(connection, MHD_HTTP_SERVICE_UNAVAILABLE, "too many requests are under way; try again\n");
+    if (!n) { // to the protocol a blank line, which nobody answers
+        count(w, &w->n_asking, -1, WEB_ASKING_MAX);
+        return say(connection, MHD_HTTP_BAD_REQUEST, "expected one JSON object, {\"do\":\"status\"}\n");
+    }
     for (size_t i = 0; i < n; i++)
         if (body[i] == '\n' || body[i] == '\r') // to JSON a blank like others; to the protocol the end of a request
             body[i] = ' ';
     set_doing(w, connection, SERVING);
     MHD_set_connection_option(connection, MHD_CONNECTION_OPTION_TIMEOUT, 0u); // a take lasts longer than the library waits
     const int rigd_fd = connect_to_rigd(w);
-    if (rigd_fd >= 0 && send_all(rigd_fd, body, n) && send_all(rigd_fd, "\n", 1))
+    const bool asked = rigd_fd >= 0; // whatever came of it: a request must not be made twice
+    if (asked && send_all(rigd_fd, body, n) && send_all(rigd_fd, "\n", 1))
         answer = read_line(rigd_fd, browser_fd, &n_answer);
-    if (rigd_fd >= 0)
+    if (asked)
         close(rigd_fd);
     MHD_set_connection_option(connection, MHD_CONNECTION_OPTION_TIMEOUT, (unsigned)IDLE_S); // counts from now
     count(w, &w->n_asking, -1, WEB_ASKING_MAX);
     set_doing(w, connection, SENDING);
+    if (!answer && asked) // not 503: that one may be tried again, and this would press the shutters twice
+        return say(connection, MHD_HTTP_BAD_GATEWAY, "rigd took the request and did not answer; it may be under way all the same: look at the takes; journalctl -u rigd says why\n");
     if (!answer)
         return say(connection, MHD_HTTP_SERVICE_UNAVAILABLE, "rigd does not answer; journalctl -u rigd says why\n");
     return queue(connection, MHD_HTTP_OK, MHD_create_response_from_buffer(n_answer, answer, MHD_RESPMEM_MUST_FREE), "application/json", take_policy);

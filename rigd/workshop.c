@@ -332,6 +332,10 @@ static void on_line(void *arg, int job, const char *line)
     int64_t done = 0, total = 0;
     if (json_parse(&v, line, strlen(line), NULL))
         return; // chatter
+    if (json_length(v, "") >= 0) { // an array: it is passed on as an object, and who adds to it would be mistaken
+        json_free(v);
+        return;
+    }
     json_get_string(v, "stage", &stage);
     json_get_int(v, "done", &done);
     json_get_int(v, "total", &total);

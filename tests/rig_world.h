@@ -36,6 +36,7 @@ struct fault {
     int extra;          // writes one file more
     bool wrong_setting, low_battery, autofocus, no_card;
     int unreadable;     // LibRaw does not know this copy
+    int no_start;       // its worker cannot be started (no memory, no program)
     int late_file;      // the picture is announced and listed after the next exposure only
 };
 
@@ -93,10 +94,14 @@ static struct world {
     int n_to_open;           // pressed bodies whose shutter has not opened
     double shutter_s;
     int n_fired, fire_err, n_fire_refusals, abilities;
+    bool waits_for_button;   // loaded, not pressed
+    struct trigger_shot loaded;
     int64_t open_first_ns[N_MAX];
     bool supply_off[N_MAX];
     // what was seen
-    int n_takes_done, n_preflights_done, n_lags_done, n_kills, n_said;
+    int n_takes_done, n_preflights_done, n_lags_done, n_kills, n_said, n_not_started;
+    int n_identified[N_MAX];
+    char identified[320]; // the last one's text
     uint64_t trace; // hash of all actions
     char said[400][320];
     int64_t quarantined_ns[N_MAX], ready_again_ns[N_MAX];
@@ -454,6 +459,34 @@ static inline int64_t latency(const struct camera_command *c)
     }
 }
 
+// The trigger carries out a shot.
+static inline void execute(const struct trigger_shot *shot)
+{
+    w.shutters_held = true;
+    w.n_fired++;
+    w.exposed_ns = w.released_ns = shot->at_ns + (int64_t)shot->hold_ms * MS;
+    w.n_to_open = 0;
+    for (int i = 0; i < w.config.n_cameras; i++) {
+        if (shot->skip[i / 64] >> i % 64 & 1)
+            continue;
+        const int64_t press = shot->at_ns - w.now + (int64_t)shot->delay_us[i] * 1000;
+        const int64_t release = w.now + press + (int64_t)shot->hold_ms * MS;
+        later(press, W_PRESS, i, 0);
+        w.n_to_open++;
+        w.released_ns = release > w.released_ns ? release : w.released_ns;
+        assert_true(shot->half_ms + shot->delay_us[i] / 1000 + shot->hold_ms <= w.config.trigger.max_hold_ms); // it would be refused
+    }
+    later(w.released_ns - w.now, W_FIRED, -1, shot->at_ns);
+}
+
+static inline void press_button(void)
+{
+    assert_true(w.waits_for_button);
+    w.waits_for_button = false;
+    w.loaded.at_ns = w.now + (int64_t)w.loaded.half_ms * MS;
+    execute(&w.loaded);
+}
+
 static inline void obey(const struct rig_action *a)
 {
     struct sim_camera *c = a->camera >= 0 ? &w.camera[a->camera] : NULL;
@@ -464,6 +497,12 @@ static inline void obey(const struct rig_action *a)
         c->worker = true;
         c->generation++;
         c->in_flight = c->open = false;
+        if (strikes(&c->fault.no_start)) {
+            c->worker = false;
+            w.n_not_started++;
+            rig_worker_gone(w.rig, w.now, a->camera, "cannot start: Cannot allocate memory");
+            break;
+        }
         later((int64_t)(uniform(30, 90) * MS), W_HELLO, a->camera, 0);
         break;
     case RIG_KILL:
@@ -528,24 +567,18 @@ static inline void obey(const struct rig_action *a)
             rig_fired(w.rig, w.now, -ETIME, 0, 0);
             break;
         }
-        w.shutters_held = true;
-        w.n_fired++;
         w.silent_until_ns = INT64_MAX;
-        w.exposed_ns = w.released_ns = a->shot.at_ns + (int64_t)a->shot.hold_ms * MS;
-        w.n_to_open = 0;
-        for (int i = 0; i < w.config.n_cameras; i++) {
-            if (a->shot.skip[i / 64] >> i % 64 & 1)
-                continue;
-            const int64_t press = a->shot.at_ns - w.now + (int64_t)a->shot.delay_us[i] * 1000;
-            const int64_t release = w.now + press + (int64_t)a->shot.hold_ms * MS;
-            later(press, W_PRESS, i, 0);
-            w.n_to_open++;
-            w.released_ns = release > w.released_ns ? release : w.released_ns;
-            assert_true(a->shot.half_ms + a->shot.delay_us[i] / 1000 + a->shot.hold_ms <= w.config.trigger.max_hold_ms); // it would be refused
-        }
-        later(w.released_ns - w.now, W_FIRED, -1, a->shot.at_ns);
+        w.loaded = a->shot;
+        w.waits_for_button = a->shot.on_button;
+        if (!w.waits_for_button)
+            execute(&a->shot);
         break;
     case RIG_RELEASE:
+        if (w.waits_for_button) {
+            w.waits_for_button = false;
+            w.silent_until_ns = 0; // no shot
+            later(MS, W_CALL, -1, 0);
+        }
         w.shutters_held = false;
         break;
     case RIG_MANIFEST:
@@ -573,6 +606,8 @@ static inline void obey(const struct rig_action *a)
             w.silent_until_ns = 0; // no shot
         break;
     case RIG_IDENTIFIED:
+        w.n_identified[a->camera]++;
+        memcpy(w.identified, a->text, sizeof(w.identified));
         break;
     case RIG_HEAD:
         assert_false(w.shutters_held);
@@ -663,7 +698,8 @@ static inline void happen(const struct happening *h)
     case W_MANIFEST:
         rig_manifest_written(w.rig, w.now, w.manifest_err);
         break;
-    case W_CALL:
+    case W_CALL: // released while it waited
+        rig_fired(w.rig, w.now, -ECANCELED, 0, 0);
         break;
     case W_HEAD: {
         const bool fails = w.n_head_fails > 0;

@@ -58,6 +58,20 @@ kill -USR2 $rigd
 check "the cable falls out: rigd says that the trigger is gone" within 30 status '"trigger":"\(broken\|not there\)"'
 check "plugged in again it is found again" board_ready
 check "and the button works again" press 3
+check "ready a third time" board_ready
+check "it says what a press would do" status '"button":"takes"'
+"$BIN/rigctl" capture --on-button --name armed >"$D/armed" 2>&1 &
+armed=$!
+check "armed, it says that the next press fires" within 150 status '"state":"armed".*"button":"fires"'
+check "a take from here is refused, and why is said" sh -c "! $BIN/rigctl capture 2>&1 | grep -q verified; $BIN/rigctl status | grep 'armed: the trigger'"
+check "the board fires, and its frames are fetched" press 4
+check "who armed it has the answer" wait $armed
+check "ready a fourth time" board_ready
+"$BIN/rigctl" capture --on-button --name cancelled >"$D/armed" 2>&1 &
+armed=$!
+check "armed once more" within 150 status '"button":"fires"'
+check "cancelled, it is disarmed at once" sh -c "$BIN/rigctl cancel"
+check "with no frame, and a reason" sh -c "! wait $armed; sleep .5; grep -q 'the button was not pressed' $D/armed $D/takes/*cancelled/take.json"
 ended() { ! is_running $rigd; }
 kill $rigd
 check "rigd ends when asked to" within 30 ended

@@ -198,6 +198,44 @@ static void paused_is_stopped_and_a_stopped_one_still_ends(void **state)
     unlink(scratch_path("pid")), unlink(scratch_path("child"));
 }
 
+static int parent_of(int pid)
+{
+    char path[40];
+    int parent = 0;
+    snprintf(path, sizeof(path), "/proc/%d/stat", pid);
+    FILE *f = fopen(path, "r");
+    assert_non_null(f);
+    assert_int_equal(fscanf(f, "%*d (sh) %*c %d", &parent), 1);
+    fclose(f);
+    return parent;
+}
+
+// A keeper that gets no processor for a while finds all of them at once.
+static void the_last_one_asked_for_holds(void **state)
+{
+    (void)state;
+    struct executor *e = open_executor();
+    const int job = start_shell(e, "echo $$ >pid; sleep 1000", false, "");
+    const int pid = number_in("pid"), keeper = parent_of(pid);
+    executor_signal(e, job, EXECUTOR_PAUSE);
+    assert_true(becomes(pid, "T"));
+    kill(keeper, SIGSTOP);
+    assert_true(becomes(keeper, "T"));
+    executor_signal(e, job, EXECUTOR_CONTINUE);
+    executor_signal(e, job, EXECUTOR_PAUSE);
+    executor_signal(e, job, EXECUTOR_CONTINUE);
+    executor_signal(e, job, EXECUTOR_PAUSE);
+    kill(keeper, SIGCONT);
+    for (int turn = 0; turn < 10; turn++) {
+        assert_true(becomes(keeper, "S"));
+        assert_true(becomes(pid, "T"));
+        nanosleep(&(struct timespec){ 0, 20000000 }, NULL);
+    }
+    assert_int_equal(state_of(pid), 'T');
+    executor_close(e);
+    unlink(scratch_path("pid"));
+}
+
 static void one_that_does_not_listen_is_killed_with_its_children(void **state)
 {
     (void)state;
@@ -344,6 +382,7 @@ int main(void)
         cmocka_unit_test(a_log_takes_what_it_says),
         cmocka_unit_test(what_cannot_be_run_says_why),
         cmocka_unit_test(paused_is_stopped_and_a_stopped_one_still_ends),
+        cmocka_unit_test(the_last_one_asked_for_holds),
         cmocka_unit_test(one_that_does_not_listen_is_killed_with_its_children),
         cmocka_unit_test(nothing_outlives_the_daemon),
         cmocka_unit_test(a_shared_lock_is_held_as_long_as_the_work_of_a_killed_daemon),

@@ -519,7 +519,7 @@ static void a_ledger_reads_back_as_it_was_written(void **state)
     struct ledger l, back;
     make_config(&config);
     ledger_init(&l, &config);
-    strcpy(l.id, ID), strcpy(l.name, "story"), strcpy(l.created, "2026-11-22T09:00:00Z"), strcpy(l.reason, "\"why\" not");
+    strcpy(l.id, ID), strcpy(l.name, "story"), strcpy(l.created, "2026-11-22T09:00:00Z"), strcpy(l.reason, "\"why\" not"), strcpy(l.panorama_take, "20261121T080000_light");
     l.state = TAKE_FAILED, l.spread_ns = 123456789, l.sigma_ns = 5, l.n_measured = 3, l.jitter_ns = -4, l.shot_utc_ms = 1795338000123, l.synchronised = true;
     struct ledger_camera *c = &l.camera[1];
     c->debt = DEBT_MISSED, c->lag_ns = -7, c->delay_us = 990000, c->battery_percent = 0, c->expected = true;
@@ -555,7 +555,7 @@ static void a_ledger_reads_back_as_it_was_written(void **state)
     }
     static const char *const edits[][2] = {
         { "raw/A01.nef", "../A01.nef" }, { "raw/A01_2.nef", "raw/A01.nef" }, { "\"A02\"", "\"A01\"" }, { "\"A02\"", "\"A/2\"" }, { "\"deleted\"", "\"eaten\"" },
-        { "0123456789abcdef0123456789abcdef", "" }, { "studiorig take 1", "studiorig take 2" }, { ID, "../../etc" }, { "DSC_0100.NEF", "../../x" },
+        { "0123456789abcdef0123456789abcdef", "" }, { "studiorig take 1", "studiorig take 2" }, { ID, "../../etc" }, { "20261121T080000_light", "../../light" }, { "DSC_0100.NEF", "../../x" },
     };
     for (size_t i = 0; i < sizeof(edits) / sizeof(edits[0]); i++) {
         struct ledger bad;

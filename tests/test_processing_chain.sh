@@ -45,6 +45,7 @@ mkdir -p "$out"
 echo half >"$out/half"
 begin "$preset" "$2"
 echo "{\"stage\":\"joint\",\"done\":3,\"total\":10,\"seconds\":1.5}" >&"$STUDIORIG_PROGRESS_FD"
+echo '[1]' >&"$STUDIORIG_PROGRESS_FD" # JSON, but nothing that can be told to people
 rm "$out/half"
 echo glb >"$out/model.glb"
 echo "<html>" >"$out/report.html"
@@ -197,10 +198,20 @@ rm -f "$D/fake/pid.standard"
 make_take 20260401T000000000_long capture
 restart_hard
 check "a long solve is under way" await test -s "$D/fake/pid.standard"
-stopped() { [ "$(cut -d' ' -f3 "/proc/$(cat "$D/fake/pid.standard")/stat" 2>/dev/null)" = T ]; }
+stopped() { # looks often, and from before the take on: that lasts a second
+    pid=$(cat "$D/fake/pid.standard") i=0
+    while [ $i -lt 3000 ] && read -r stat <"/proc/$pid/stat"; do
+        case $stat in *') T '*) return 0 ;; esac
+        i=$((i + 1))
+        sleep .01
+    done
+    return 1
+}
+stopped &
+looker=$!
 "$BIN/rigctl" capture --name second >"$D/second" 2>&1 &
 ctl=$!
-check "it is paused while the rig shoots" await stopped
+check "it is paused while the rig shoots" wait $looker
 wait $ctl
 check "and the shot is verified" grep -q ': verified' "$D/second"
 second=$(ls "$D/takes" | grep second)

@@ -204,6 +204,27 @@ static void each_camera_with_a_raw_is_developed_once(void **state)
     products_close(p);
 }
 
+static void a_size_that_cannot_be_is_no_memory_to_count_with(void **state)
+{
+    (void)state;
+    struct ledger l;
+    char dir[900];
+    make_take(TAKE, false);
+    snprintf(dir, sizeof(dir), "%s/" TAKE, takes);
+    assert_int_equal(ledger_read(&l, dir), 0);
+    for (int k = 0; k < l.camera[0].n_objects; k++)
+        l.camera[0].object[k].object.size_bytes = INT64_MAX;
+    char *text = ledger_text(&l);
+    assert_int_equal(ledger_commit(text, dir), 0);
+    free(text);
+    ledger_free(&l);
+    struct products *p = open_take(TAKE);
+    const struct looked looked = look(p, STEP_DEVELOP);
+    assert_true(looked.item[0].memory_bytes > INT64_C(1) << 40); // of 200 such the sum is still a number
+    assert_true(looked.item[0].memory_bytes < INT64_MAX / 1000);
+    products_close(p);
+}
+
 static void the_light_is_the_newest_panorama_before_the_take(void **state)
 {
     (void)state;
@@ -503,6 +524,7 @@ int main(void)
 {
     const struct CMUnitTest tests[] = {
         cmocka_unit_test_setup_teardown(each_camera_with_a_raw_is_developed_once, set_up, tear_down),
+        cmocka_unit_test_setup_teardown(a_size_that_cannot_be_is_no_memory_to_count_with, set_up, tear_down),
         cmocka_unit_test_setup_teardown(the_light_is_the_newest_panorama_before_the_take, set_up, tear_down),
         cmocka_unit_test_setup_teardown(geometry_of_a_hook_of_a_fixed_rig_or_ones_own, set_up, tear_down),
         cmocka_unit_test_setup_teardown(a_solve_gets_its_name_when_it_is_whole, set_up, tear_down),

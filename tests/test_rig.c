@@ -229,6 +229,49 @@ static void a_camera_that_stays_busy_is_quarantined_after_5_s(void **state)
     tear_down();
 }
 
+// No memory for a process, or no program: other cameras and clients are heard meanwhile.
+static void a_worker_that_cannot_be_started_is_not_tried_without_end(void **state)
+{
+    (void)state;
+    set_up(4, 9);
+    w.camera[1].fault.no_start = 1000;
+    open_all();
+    run(60 * S, false);
+    assert_true(w.quarantined_ns[1] > 0);
+    assert_in_range(w.n_not_started, 3, 60); // at most twenty in each of three troubles
+    w.camera[1].fault.no_start = 0;
+    run(90 * S, false);
+    assert_int_equal(rig_camera(w.rig, 1).condition, RIG_READY);
+    tear_down();
+}
+
+// Whatever becomes of the camera: who waits for the answer gets it, once.
+static void who_asks_which_camera_it_is_gets_an_answer(void **state)
+{
+    (void)state;
+    for (int story = 0; story < 7; story++) {
+        char why[200];
+        set_up(4, 70 + (uint64_t)story);
+        open_all();
+        run(S, false);
+        struct fault *f = &w.camera[1].fault;
+        f->hang[CAMERA_IDENTIFY] = story == 1;
+        f->crash[CAMERA_IDENTIFY] = story == 2;
+        f->lost[CAMERA_IDENTIFY] = story == 3;
+        f->busy[CAMERA_IDENTIFY] = story == 4 ? 2 : story == 5 ? -1 : 0;
+        f->fails[CAMERA_IDENTIFY] = story == 6;
+        f->trouble = CAMERA_REFUSED;
+        assert_int_equal(rig_identify(w.rig, w.now, 1, why), 0);
+        run(30 * S, false);
+        assert_int_equal(w.n_identified[1], 1);
+        if (story == 0 || story == 4) // it was busy for a moment
+            assert_string_equal(w.identified, "");
+        else
+            assert_true(w.identified[0]);
+        tear_down();
+    }
+}
+
 static void an_unfit_camera_stops_the_take_unless_it_may_be_left_out(void **state)
 {
     (void)state;
@@ -517,6 +560,53 @@ static void cancelling_before_the_shot_costs_nothing_after_it_no_frame(void **st
     }
 }
 
+// Armed is armed: minutes later a press fires, no camera hears anything meanwhile, and who cancels has pressed nothing.
+static void armed_it_waits_for_the_button(void **state)
+{
+    (void)state;
+    for (int story = 0; story < 3; story++) {
+        char why[200];
+        set_up(4, 90 + (uint64_t)story);
+        open_all();
+        const struct rig_take take = { "20261122T090000_c", "c", "", 0, "/takes", NULL, true };
+        assert_int_equal(rig_capture(w.rig, w.now, &take, false, why), -EINVAL); // this trigger's button only tells us
+        assert_non_null(strstr(why, "trigger board"));
+        w.abilities |= TRIGGER_BUTTON | TRIGGER_WAITS;
+        rig_trigger_is(w.rig, w.now, w.abilities);
+        for (int i = 0; i < 4; i++)
+            w.camera[i].take_first = w.camera[i].n_card + 1;
+        assert_int_equal(rig_capture(w.rig, w.now, &take, false, why), 0);
+        assert_false(rig_waits_for_button(w.rig));
+        run(300 * S, true);
+        assert_true(w.waits_for_button);
+        assert_true(rig_waits_for_button(w.rig));
+        assert_int_equal(rig_state(w.rig), TAKE_ARMED);
+        assert_int_equal(rig_deadline_ns(w.rig), INT64_MAX);
+        if (story == 0) {
+            press_button();
+        } else if (story == 1) {
+            assert_int_equal(rig_cancel(w.rig, w.now, why), 0);
+        } else { // the link breaks: perhaps it was pressed, the cards will tell
+            w.waits_for_button = false;
+            w.silent_until_ns = 0;
+            rig_fired(w.rig, w.now, -EIO, 0, 0);
+        }
+        drain_actions();
+        run(60 * S, true);
+        drain_actions();
+        assert_int_equal(w.n_takes_done, 1);
+        assert_int_equal(w.n_fired, story == 0);
+        assert_int_equal(rig_ledger(w.rig)->state, story == 0 ? TAKE_VERIFIED : TAKE_FAILED);
+        if (story == 0)
+            check_accounts(rig_ledger(w.rig));
+        if (story == 1)
+            assert_string_equal(rig_ledger(w.rig)->reason, "cancelled; the button was not pressed");
+        assert_false(rig_waits_for_button(w.rig));
+        assert_int_equal(capture_as("20261122T090001_d", false)->state, TAKE_VERIFIED); // and the next one is as ever
+        tear_down();
+    }
+}
+
 // Five thousand takes with every fault there is, unattended.
 static void five_thousand_takes_lose_nothing(void **state)
 {
@@ -576,6 +666,8 @@ int main(void)
         cmocka_unit_test(others_do_not_wait_for_a_camera_in_trouble),
         cmocka_unit_test(a_camera_is_recovered_or_quarantined_within_15_s),
         cmocka_unit_test(a_camera_that_stays_busy_is_quarantined_after_5_s),
+        cmocka_unit_test(a_worker_that_cannot_be_started_is_not_tried_without_end),
+        cmocka_unit_test(who_asks_which_camera_it_is_gets_an_answer),
         cmocka_unit_test(an_unfit_camera_stops_the_take_unless_it_may_be_left_out),
         cmocka_unit_test(a_full_disk_stops_before_the_shutters),
         cmocka_unit_test(a_ledger_that_cannot_be_written_leaves_the_frames_on_the_cards),
@@ -588,6 +680,7 @@ int main(void)
         cmocka_unit_test(a_take_is_resumed_from_its_ledger),
         cmocka_unit_test(a_take_that_was_never_exposed_says_so),
         cmocka_unit_test(cancelling_before_the_shot_costs_nothing_after_it_no_frame),
+        cmocka_unit_test(armed_it_waits_for_the_button),
         cmocka_unit_test(five_thousand_takes_lose_nothing),
     };
     return cmocka_run_group_tests(tests, NULL, NULL);

@@ -16,6 +16,7 @@
 #include <sys/eventfd.h>
 #include <sys/socket.h>
 #include <sys/stat.h>
+#include <sys/un.h>
 #include <time.h>
 
 // ---- a daemon of which there is nothing but its door -------------------------------------------------------------------------------
@@ -515,6 +516,49 @@ static void sixty_four_at_once_are_all_answered(void **state)
     assert_true(n >= 64);
 }
 
+static void an_empty_request_is_answered_at_once(void **state)
+{
+    (void)state;
+    for (int i = 0; i < 2 * WEB_ASKING_MAX; i++) // none of them takes a place for good
+        assert_int_equal(post("", ""), 400);
+    assert_int_equal(post("", "{\"do\":\"status\"}"), 200);
+}
+
+// Takes each request, and leaves.
+static void *take_and_leave(void *arg)
+{
+    int *listener = arg;
+    for (int fd; (fd = accept(listener[0], NULL, NULL)) >= 0; close(fd)) {
+        char line[200];
+        if (recv(fd, line, sizeof(line), 0) > 0)
+            listener[1]++;
+    }
+    return NULL;
+}
+
+// 503 invites to try again: a rigd that dies of a capture would fire the next one's shutters without anybody's asking.
+static void what_rigd_took_is_not_to_be_tried_again(void **state)
+{
+    struct sockaddr_un address = { .sun_family = AF_UNIX };
+    char real[sizeof(config.socket_path)];
+    int listener[2] = { socket(AF_UNIX, SOCK_STREAM | SOCK_CLOEXEC, 0), 0 };
+    pthread_t thread;
+    (void)state;
+    strcpy(real, config.socket_path);
+    snprintf(address.sun_path, sizeof(address.sun_path), "%.90s", scratch_path("dying"));
+    assert_int_equal(bind(listener[0], (struct sockaddr *)&address, sizeof(address)), 0);
+    assert_int_equal(listen(listener[0], 4), 0);
+    assert_int_equal(pthread_create(&thread, NULL, take_and_leave, listener), 0);
+    strcpy(config.socket_path, address.sun_path);
+    assert_int_equal(post("", "{\"do\":\"capture\"}"), 502);
+    shutdown(listener[0], SHUT_RDWR);
+    pthread_join(thread, NULL);
+    close(listener[0]);
+    assert_int_equal(listener[1], 1);
+    assert_int_equal(post("", "{\"do\":\"capture\"}"), 503); // it did not take this one
+    strcpy(config.socket_path, real);
+}
+
 static void connections_that_ask_nothing_keep_nobody_out(void **state)
 {
     enum { N = 3 * WEB_CONNECTIONS_MAX };
@@ -724,6 +768,8 @@ int main(void)
         cmocka_unit_test_setup_teardown(listeners_are_bounded_and_make_room_when_they_leave, open_plain, close_web),
         cmocka_unit_test_setup_teardown(requests_under_way_are_bounded_and_end_with_who_asked, open_plain, close_web),
         cmocka_unit_test_setup_teardown(sixty_four_at_once_are_all_answered, open_plain, close_web),
+        cmocka_unit_test_setup_teardown(an_empty_request_is_answered_at_once, open_plain, close_web),
+        cmocka_unit_test_setup_teardown(what_rigd_took_is_not_to_be_tried_again, open_plain, close_web),
         cmocka_unit_test_setup_teardown(connections_that_ask_nothing_keep_nobody_out, open_plain, close_web),
         cmocka_unit_test_setup_teardown(who_leaves_in_the_middle_harms_nobody, open_plain, close_web),
         cmocka_unit_test_setup_teardown(nonsense_is_answered_or_left, open_plain, close_web),

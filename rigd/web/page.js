@@ -71,12 +71,13 @@ function showEnd(take) {
     showOutcome("take " + take.id + ": " + take.state + (take.reason ? ": " + take.reason : "") + (take.seconds ? " after " + take.seconds.toFixed(1) + " s" : ""), take.state === "failed");
 }
 
-async function capture(event) {
+async function capture(event, onButton = false) {
     event.preventDefault();
     if ($("capture").disabled) return;
     pressed = true;
     showButtons();
     const request = { do: "capture", name: $("name").value.trim() || "take" };
+    if (onButton) request.on_button = true;
     if ($("leave-out").checked) request.without_missing = true;
     await press(request, showEnd);
     pressed = false;
@@ -118,7 +119,7 @@ function showButtons() {
     else if (pressed) why = "Asked for; waiting for rigd.";
     else {
         free = true;
-        why = "Ready: " + rig.n_ready + " of " + rig.n_cameras + " cameras.";
+        why = "Ready: " + rig.n_ready + " of " + rig.n_cameras + " cameras." + (rig.button === "takes" ? " The button at the rig begins a take, too." : "");
         if (unfit.length) {
             const named = unfit.slice(0, 4).map(c => c.name + " (" + c.port + ") is " + c.condition + (c.note ? ": " + c.note : "")).join("; ");
             why = sentence(rig.n_ready + " of " + rig.n_cameras + " cameras are ready. " + named + (unfit.length > 4 ? "; and " + (unfit.length - 4) + " more" : "")) +
@@ -128,6 +129,8 @@ function showButtons() {
     const busy = connected && rig && rig.busy;
     setText($("why"), why);
     $("capture").disabled = !free;
+    $("arm").hidden = !rig || !rig.can_arm;
+    $("arm").disabled = !free;
     $("preflight").disabled = !connected || !rig || busy;
     $("cancel").hidden = !busy;
     $("panorama").hidden = !rig || !rig.panorama_camera;
@@ -380,6 +383,7 @@ setInterval(() => {
 }, 1000);
 
 $("capture-form").onsubmit = capture;
+$("arm").onclick = event => capture(event, true);
 $("leave-out").onchange = showButtons;
 $("cancel").onclick = () => press({ do: "cancel" }, () => showOutcome("cancelled; frames that were exposed are fetched all the same"));
 $("preflight").onclick = preflight;

@@ -65,10 +65,17 @@ my @expected = grep { !/sandboxed/ } $page->complaints($rig->url);
 is "@expected", '', 'no exception, no complaint of the policy, nothing asked of anybody else' or diag "@expected";
 $page->{events} = [];
 $page->go($rig->url);
-ok $page->until_true('!document.querySelector("#capture").disabled'), 'back on the page';
+ok $page->until_true('!document.querySelector("#capture").disabled && takes.length > 0'), 'back on the page';
 
 # what this rig has not: a panorama head, and takes that are processed; as rigd tells of them
 ok $page->js('document.querySelector("#panorama").hidden'), 'without [panorama] there is no button for it';
+ok $page->js('document.querySelector("#arm").hidden'), '... and none to arm a trigger that cannot fire by itself';
+$page->js('take({ event: "rig", body: Object.assign({}, rig, { can_arm: true, button: "takes" }) })');
+ok $page->js('!document.querySelector("#arm").hidden && !document.querySelector("#arm").disabled'), 'one that can is offered to be armed';
+like $text->('#why'), qr/button at the rig/, '... and what a press does before is said';
+$page->js('take({ event: "rig", body: Object.assign({}, rig, { busy: true, state: "armed", button: "fires", refusal: "armed: the trigger\'s button fires; cancel (rigctl cancel) disarms" }) })');
+ok $page->js('document.querySelector("#arm").disabled && !document.querySelector("#cancel").hidden'), 'armed, it can be cancelled';
+like $text->('#why'), qr/Armed: the trigger's button fires/, '... and the page says so';
 $page->js('take({ event: "rig", body: Object.assign({}, rig, { busy: true, state: "exposing", panorama_camera: "P01", prompt: "Turn the head to 90 degrees", take: Object.assign({}, takes[0], { id: "T", name: "lights" }),'
     . ' processing: [{ take: "20261122T100000000_vase", settled: false, steps: [{ step: "sheet", state: "done" }, { step: "develop", state: "running", n: 6, n_done: 2 }, { step: "preview", state: "waiting" }] }] }) });'
     . 'take({ event: "panorama", body: { take: "T", step: "expose", stop: 2, n_stops: 6, frame: 3, exposure: "1/60" } })');
@@ -77,7 +84,7 @@ ok !$page->js('document.querySelector("#continue").hidden || document.querySelec
 is $text->('#state'), 'Lights: exposing, stop 2 of 6, exposure 3 (1/60 s).', '... and where the panorama is';
 is $text->('#making'), 'vase: develop running 2 of 6; preview waiting', 'how far the processing of a take has come';
 $page->go($rig->url);
-ok $page->until_true('!document.querySelector("#capture").disabled'), 'back on the page';
+ok $page->until_true('!document.querySelector("#capture").disabled && takes.length > 0'), 'back on the page';
 
 for my $width (360, 800, 1400) {
     $page->size($width, 900);
