@@ -545,6 +545,12 @@ static void print_report(const struct json *t)
             printf("  %s clipped %.2f %%", text_of(c, "developed"), 100 * number_of(c, "clipped_share", 0));
         printf("%s%s\n", text_of(c, "note")[0] ? "  " : "", text_of(c, "note"));
     }
+    if (json_length(t, "time_line") > 0)
+        printf("  time line, seconds after the button\n");
+    for (int i = 0; i < json_length(t, "time_line"); i++) {
+        const struct json *s = element(t, "time_line", i);
+        printf("    %-11s %8.2f .. %8.2f   took %8.2f\n", text_of(s, "stage"), number_of(s, "began_s", 0), number_of(s, "ended_s", 0), number_of(s, "took_s", 0));
+    }
     for (int i = 0; i < json_length(t, "processing.solves"); i++) {
         const struct json *v = element(t, "processing.solves", i);
         printf("  solve %-9s", text_of(v, "name"));

@@ -74,11 +74,13 @@ static int merge_lights(struct lights *out, int32_t *group, const struct lights 
     return 0;
 }
 
+enum { N_SWEPT = 5 };
+
 // The common distance of all lights, by brute trial at few texels: one group, so a Jacobian costs little.
 static int sweep(const struct photometric *p, const struct lights *lights, const struct rays *rays,
                  const struct joint_settings *set, struct photometric_state *best, double *best_cost, struct stage1 *total)
 {
-    static const double distances_m[] = { .7, 1.1, 1.7, 2.6, 4 };
+    static const double distances_m[N_SWEPT] = { .7, 1.1, 1.7, 2.6, 4 };
     int32_t *one_group = calloc((size_t)lights->n, sizeof(*one_group));
     struct photometric coarse = *p;
     struct stage1 s = { 0 };
@@ -88,7 +90,7 @@ static int sweep(const struct photometric *p, const struct lights *lights, const
     coarse.n_groups = 1;
     const struct stage1 all = { .p = *p };
     coarse.texel_step = stage1_step_for(&all, set->coarse_samples);
-    const int n = set->start_distance_m > 0 ? 1 : (int)(sizeof(distances_m) / sizeof(distances_m[0]));
+    const int n = set->start_distance_m > 0 ? 1 : N_SWEPT;
     for (int k = 0; !err && k < n; k++) {
         double cost;
         err = stage1_new(&s, &coarse, lights, rays, set);
@@ -107,6 +109,7 @@ static int sweep(const struct photometric *p, const struct lights *lights, const
         total->n_jacobians += s.n_jacobians, total->n_evaluations += s.n_evaluations;
         total->n_sweep_jacobians += s.n_jacobians;
         stage1_free(&s);
+        progress_add(N_SWEPT / n);
     }
     free(one_group);
     return err;
@@ -276,6 +279,7 @@ static int solve_joint(struct stage1 *s, const struct photometric *p, const stru
     if (err)
         goto end;
     coarse.group_of_light = group;
+    progress_begin("sweep", 2 * N_SWEPT);
     err = photometric_state_new(&start, &coarse, &one);
     if (!err)
         err = sweep(&coarse, &one, s->rays, s->set, &start, &cost, s);
@@ -290,6 +294,7 @@ static int solve_joint(struct stage1 *s, const struct photometric *p, const stru
         if (!err && mirrored_cost < .5 * cost)
             out->doubts |= DOUBT_MIRRORED;
     }
+    progress_end();
     if (err)
         goto end;
     photometric_pack(&coarse, &start, s->x);
