@@ -265,7 +265,7 @@ void rig_begin_fire(struct rig *r, int64_t now)
                 (room_us < MAX_DELAY_US ? room_us : MAX_DELAY_US) / 1000);
     }
     struct trigger_shot *shot = &rig_act(r, RIG_FIRE, CONFIG_NONE)->shot;
-    r->at_ns = now + (FIRE_LEAD_MS + (int64_t)half_ms) * MS;
+    r->at_ns = now + (((int64_t)FIRE_LEAD_MS << r->n_fire_tries) + half_ms) * MS; // a machine that was late once gets longer
     *shot = (struct trigger_shot){ .at_ns = r->at_ns, .half_ms = half_ms, .hold_ms = t->hold_ms, .delay_us = r->delay_us, .skip = r->skip };
     r->phase_due_ns = r->at_ns + MAX_DELAY_US * 1000 + (t->hold_ms + 2000) * MS;
 }
