@@ -136,14 +136,14 @@ void contact_judge(struct contact_entry *e, int n, bool developed)
     for (int i = 0; i < n; i++) {
         if (!isnan(e[i].figures.sharpness))
             sharpness[n_sharp++] = e[i].figures.sharpness;
-        if (e[i].figures.median > 0)
-            light[n_light++] = e[i].figures.median;
+        if (e[i].figures.p99 > 0)
+            light[n_light++] = e[i].figures.p99;
     }
     const double usual_sharpness = median_of(sharpness, n_sharp), usual_light = median_of(light, n_light);
     for (int i = 0; i < n; i++) {
         const struct contact_figures *f = &e[i].figures;
         e[i].relative_sharpness = n_sharp >= 3 && usual_sharpness > 0 ? f->sharpness / usual_sharpness : NAN;
-        e[i].relative_ev = n_light >= 3 && usual_light > 0 && f->median > 0 ? log2(f->median / usual_light) : NAN;
+        e[i].relative_ev = n_light >= 3 && usual_light > 0 && f->p99 > 0 ? log2(f->p99 / usual_light) : NAN;
         e[i].doubts = (e[i].relative_sharpness < soft_below ? CONTACT_SOFT : 0) | (f->clipped_share > clipped_above ? CONTACT_CLIPPED : 0) |
                       (e[i].relative_ev < dark_below_ev || (!developed && f->p99 < dark_p99) ? CONTACT_DARK : 0);
     }

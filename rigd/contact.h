@@ -19,7 +19,7 @@ enum contact_doubt { CONTACT_SOFT = 1, CONTACT_CLIPPED = 2, CONTACT_DARK = 4 };
 struct contact_entry {
     char name[CONTACT_NAME];
     struct contact_figures figures;
-    double relative_sharpness, relative_ev; // to the median of all: factor; EV of the median luminance
+    double relative_sharpness, relative_ev; // to the median of all: factor; EV of p99: what is behind the object may be black
     unsigned doubts;
     float (*cell)[3]; // [CONTACT_CELL_HEIGHT_PX][CONTACT_CELL_PX], linear
 };

@@ -160,6 +160,23 @@ static struct json *describe_processing(const struct ledger *l)
     return o;
 }
 
+// Seconds after the button.
+static struct json *describe_time_line(const struct ledger *l)
+{
+    struct json *list = json_new_array();
+    for (int i = 0; i < l->n_stages; i++) {
+        const struct ledger_stage *s = &l->stage[i];
+        const int64_t button = !strcmp(l->stage[0].name, "button") ? l->stage[0].began_utc_ms : l->shot_utc_ms; // resumed: not noted
+        struct json *e = json_new_object();
+        json_set_string(e, "stage", s->name);
+        json_set_number(e, "began_s", 1e-3 * (double)(s->began_utc_ms - button));
+        json_set_number(e, "ended_s", 1e-3 * (double)(s->ended_utc_ms - button));
+        json_set_number(e, "took_s", 1e-3 * (double)(s->ended_utc_ms - s->began_utc_ms));
+        json_append(list, e);
+    }
+    return list;
+}
+
 struct json *describe_take(const struct ledger *l, bool with_cameras)
 {
     struct json *o = json_new_object(), *list = json_new_array(), *missing = json_new_array(), *left_out = json_new_array();
@@ -231,6 +248,8 @@ struct json *describe_take(const struct ledger *l, bool with_cameras)
     }
     if (l->jitter_ns >= 0)
         json_set_number(o, "jitter_ms", 1e-6 * (double)l->jitter_ns);
+    if (l->n_stages)
+        json_set(o, "time_line", describe_time_line(l));
     json_set(o, "missing", missing);
     json_set(o, "left_out", left_out);
     if (l->processing)

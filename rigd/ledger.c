@@ -262,6 +262,31 @@ static struct json *camera_json(const struct ledger_camera *c)
     return v;
 }
 
+void ledger_note_stage(struct ledger *l, const char *name, int64_t began_utc_ms, int64_t ended_utc_ms)
+{
+    int i = 0;
+    while (i < l->n_stages && strcmp(l->stage[i].name, name))
+        i++;
+    if (i == LEDGER_STAGES_MAX)
+        return;
+    l->n_stages += i == l->n_stages;
+    l->stage[i] = (struct ledger_stage){ .began_utc_ms = began_utc_ms, .ended_utc_ms = ended_utc_ms };
+    snprintf(l->stage[i].name, sizeof(l->stage[i].name), "%s", name);
+}
+
+static struct json *stages_json(const struct ledger *l)
+{
+    struct json *list = json_new_array();
+    for (int i = 0; i < l->n_stages; i++) {
+        struct json *o = json_new_object();
+        json_set_string(o, "stage", l->stage[i].name);
+        json_set_int(o, "began_utc_ms", l->stage[i].began_utc_ms);
+        json_set_int(o, "ended_utc_ms", l->stage[i].ended_utc_ms);
+        json_append(list, o);
+    }
+    return list;
+}
+
 static struct json *processing_json(const struct ledger *l)
 {
     struct json *v = json_new_object(), *notes = json_new_array(), *solves = json_new_array();
@@ -314,6 +339,8 @@ char *ledger_text(const struct ledger *l)
     json_set_int(shot, "n_measured", l->n_measured);
     json_set_int(shot, "jitter_ns", l->jitter_ns);
     json_set(doc, "shot", shot);
+    if (l->n_stages)
+        json_set(doc, "time_line", stages_json(l));
     if (l->processing)
         json_set(doc, "processing", processing_json(l));
     for (int i = 0; i < l->n_cameras; i++)
@@ -471,6 +498,23 @@ static void get_processing(struct reader *r, struct ledger *l)
         r->bad = true;
 }
 
+static void get_stages(struct reader *r, struct ledger *l)
+{
+    if (!json_get(r->v, "time_line")) // of takes before there was one
+        return;
+    l->n_stages = get_length(r, "time_line", LEDGER_STAGES_MAX);
+    for (int i = 0; i < l->n_stages; i++) {
+        struct ledger_stage *s = &l->stage[i];
+        struct reader e = child(r, "time_line", i);
+        get_string(&e, "stage", s->name, sizeof(s->name));
+        if (!is_plain(s->name))
+            complain(&e, "stage", "letters, digits, - and _");
+        s->began_utc_ms = get_int(&e, "began_utc_ms", 0, INT64_MAX, 0);
+        s->ended_utc_ms = get_int(&e, "ended_utc_ms", 0, INT64_MAX, 0);
+        r->bad |= e.bad;
+    }
+}
+
 static void get_exposure(struct reader *r, struct ledger_camera *c)
 {
     struct reader v = { .v = json_get(r->v, "exposure"), .file = r->file };
@@ -599,6 +643,7 @@ int ledger_parse(struct ledger *out, const char *text, size_t n_bytes, const cha
         out->n_measured = (int)get_int(&shot, "n_measured", 0, CONFIG_CAMERAS_MAX, 0);
         out->jitter_ns = get_int(&shot, "jitter_ns", INT64_MIN, INT64_MAX, -1);
     }
+    get_stages(&r, out);
     get_processing(&r, out);
     get_stops(&r, out);
     const int n = get_length(&r, "cameras", ENTRIES_MAX);

@@ -42,6 +42,13 @@ enum ledger_processing {
 };
 enum { LEDGER_NOTES_MAX = 12, LEDGER_NOTE_BYTES = 240, LEDGER_SOLVES_MAX = 3 };
 
+// One stage of a take's time line: button (press to shutters), exposed, collected, verified, then the steps of processing.h by name.
+struct ledger_stage {
+    char name[16];
+    int64_t began_utc_ms, ended_utc_ms;
+};
+enum { LEDGER_STAGES_MAX = 16 };
+
 struct ledger_solve {
     char name[16];                // preview, standard, final: solve/<name>
     bool trusted;
@@ -102,6 +109,8 @@ struct ledger {
     int64_t spread_ns, sigma_ns; // over measured bodies; -1: not measured
     int n_measured;
     int64_t jitter_ns;          // how late the press was; -1
+    int n_stages;
+    struct ledger_stage stage[LEDGER_STAGES_MAX];
     enum ledger_processing processing;
     char panorama_from[96];     // the panorama take whose panorama.exr this one's is; "": none, or its own
     int n_notes;                // what went wrong in processing, or is worth knowing: camera, slot, file, remedy
@@ -128,6 +137,7 @@ struct ledger_object *ledger_find(struct ledger_camera *c, const struct camera_o
 struct ledger_object *ledger_add(struct ledger_camera *c, const struct camera_object *o);
 
 char *ledger_text(const struct ledger *l);                      // JSON, malloc'd; NULL without memory
+void ledger_note_stage(struct ledger *l, const char *name, int64_t began_utc_ms, int64_t ended_utc_ms); // made anew: the later one stands
 int ledger_commit(const char *text, const char *take_dir);      // take.json, durable when it returns 0; else -errno (logged), the old one stands
 int ledger_read(struct ledger *out, const char *take_dir);      // 0, -ENOENT, -EINVAL (logged); *out zeroed on failure
 int ledger_parse(struct ledger *out, const char *text, size_t n_bytes, const char *name);

@@ -894,6 +894,12 @@ void processing_record(const struct processing *p, const char *take, struct proc
     const struct take *t = find(p, take);
     int n_more = 0;
     *out = (struct processing_record){ .state = TAKE_VERIFIED };
+    for (int s = 0; s < PROCESSING_N_STEPS; s++) {
+        const struct step *step = t ? &t->step[s] : NULL;
+        const bool made = step && step->state == PROCESSING_DONE && !step->was_there && step->began_ns != INT64_MIN && step->ended_ns != INT64_MIN;
+        out->began_ns[s] = made ? step->began_ns : INT64_MIN;
+        out->ended_ns[s] = made ? step->ended_ns : INT64_MIN;
+    }
     if (!t)
         return;
     const bool developed = t->step[t->is_panorama ? STEP_PANORAMA : STEP_DEVELOP].state == PROCESSING_DONE;

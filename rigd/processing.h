@@ -144,6 +144,8 @@ struct processing_record {
     enum ledger_processing processing;
     int n_notes;
     char note[PROCESSING_NOTES_MAX][PROCESSING_TEXT];
+    int64_t began_ns[PROCESSING_N_STEPS], ended_ns[PROCESSING_N_STEPS]; // of what was made in this life; INT64_MIN: was not
+    int64_t utc_offset_ms; // the caller's: UTC less that clock
 };
 void processing_record(const struct processing *p, const char *take, struct processing_record *out);
 

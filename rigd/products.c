@@ -1153,6 +1153,9 @@ int products_record(const char *take_dir, const struct processing_record *record
     l->processing = record->processing;
     l->n_notes = record->n_notes;
     memcpy(l->process_note, record->note, sizeof(l->process_note));
+    for (int s = 0; s < PROCESSING_N_STEPS; s++)
+        if (record->began_ns[s] != INT64_MIN)
+            ledger_note_stage(l, processing_step_name(s), record->utc_offset_ms + record->began_ns[s] / 1000000, record->utc_offset_ms + record->ended_ns[s] / 1000000);
     record_products(l, &p);
     text = ledger_text(l);
     err = text ? ledger_commit(text, take_dir) : -ENOMEM;

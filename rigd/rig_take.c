@@ -265,7 +265,7 @@ void rig_begin_fire(struct rig *r, int64_t now)
                 (room_us < MAX_DELAY_US ? room_us : MAX_DELAY_US) / 1000);
     }
     struct trigger_shot *shot = &rig_act(r, RIG_FIRE, CONFIG_NONE)->shot;
-    r->at_ns = now + (FIRE_LEAD_MS + (int64_t)half_ms) * MS;
+    r->at_ns = now + (((int64_t)FIRE_LEAD_MS << r->n_fire_tries) + half_ms) * MS; // a machine that was late once gets longer
     *shot = (struct trigger_shot){ .at_ns = r->at_ns, .half_ms = half_ms, .hold_ms = t->hold_ms, .delay_us = r->delay_us, .skip = r->skip };
     r->phase_due_ns = r->at_ns + MAX_DELAY_US * 1000 + (t->hold_ms + 2000) * MS;
     if (rig_waits_for_button(r)) {
@@ -356,7 +356,28 @@ void rig_end_collect(struct rig *r, int64_t now)
     rig_begin_manifest(r);
 }
 
-static void conclude(struct rig *r, int manifest_err)
+static int64_t utc_at(const struct rig *r, int64_t ns)
+{
+    return r->utc_ms + (ns - r->utc_at_ns) / MS;
+}
+
+static void draw_time_line(struct rig *r, int64_t now)
+{
+    struct ledger *l = &r->ledger;
+    const int64_t pressed_ms = l->shot_utc_ms, exposed_ms = utc_at(r, exposed_ns(r));
+    int64_t collected_ms = exposed_ms;
+    for (int i = 0; i < l->n_cameras; i++)
+        for (int k = 0; k < l->camera[i].n_objects; k++) {
+            const int64_t copied_ms = pressed_ms + l->camera[i].object[k].copied_ms;
+            collected_ms = copied_ms > collected_ms ? copied_ms : collected_ms;
+        }
+    ledger_note_stage(l, "button", r->utc_ms, pressed_ms);
+    ledger_note_stage(l, "exposed", pressed_ms, exposed_ms);
+    ledger_note_stage(l, "collected", exposed_ms, collected_ms);
+    ledger_note_stage(l, "verified", collected_ms, utc_at(r, now));
+}
+
+static void conclude(struct rig *r, int64_t now, int manifest_err)
 {
     struct ledger *l = &r->ledger;
     int n_missed = 0, n_found = 0, first = -1;
@@ -391,6 +412,8 @@ static void conclude(struct rig *r, int manifest_err)
     memcpy(r->outcome, l->reason, sizeof(r->outcome));
     if (l->reason[0])
         rig_say(r, RIG_ERROR, CONFIG_NONE, "take %s: %s", l->id, l->reason);
+    if (r->purpose == FOR_TAKE && l->shot_utc_ms)
+        draw_time_line(r, now);
     rig_set_state(r, l->reason[0] ? TAKE_FAILED : TAKE_VERIFIED);
     rig_changed(r);
     r->phase = PHASE_SETTLE;
@@ -446,13 +469,13 @@ void rig_fired(struct rig *r, int64_t now, int err, int64_t pressed_ns, int64_t 
         r->quiet_until_ns = quiet_until_ns(r);
         r->phase = PHASE_EXPOSE;
         if (r->purpose == FOR_PANORAMA && !r->ledger.shot_utc_ms)
-            r->ledger.shot_utc_ms = r->utc_ms + (r->pressed_ns - r->utc_at_ns) / MS;
+            r->ledger.shot_utc_ms = utc_at(r, r->pressed_ns);
         if (r->purpose == FOR_PANORAMA)
             rig_set_state(r, TAKE_EXPOSING); // until all of it is here
         if (r->purpose == FOR_TAKE) {
             r->ledger.synchronised = r->abilities >= 0 && (r->abilities & TRIGGER_SYNCHRONISED);
             r->ledger.jitter_ns = late_ns;
-            r->ledger.shot_utc_ms = r->utc_ms + (r->pressed_ns - r->utc_at_ns) / MS;
+            r->ledger.shot_utc_ms = utc_at(r, r->pressed_ns);
             rig_set_state(r, TAKE_EXPOSING);
         }
     }
@@ -461,6 +484,6 @@ void rig_fired(struct rig *r, int64_t now, int err, int64_t pressed_ns, int64_t 
 void rig_manifest_written(struct rig *r, int64_t now, int err)
 {
     if (r->phase == PHASE_MANIFEST)
-        conclude(r, err);
+        conclude(r, now, err);
     rig_settle(r, now);
 }

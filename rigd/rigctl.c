@@ -16,6 +16,7 @@
 #include <sys/socket.h>
 #include <sys/un.h>
 #include <termios.h>
+#include <time.h>
 #include <unistd.h>
 
 enum { EXIT_DONE = 0, EXIT_FAILED = 1, EXIT_USAGE = 2, LINE_MAX_BYTES = 64 << 20, OPTION_OPEN = 256, OPTION_MERGE, OPTION_ON_BUTTON };
@@ -142,6 +143,13 @@ static void print_progress(const struct json *p)
         fprintf(stderr, "  stop %.0f of %.0f is done: %s\n", stop, n_stops, text);
 }
 
+static int64_t clock_ns(void)
+{
+    struct timespec t;
+    clock_gettime(CLOCK_MONOTONIC, &t);
+    return (int64_t)t.tv_sec * 1000000000 + t.tv_nsec;
+}
+
 // One line when a step changes, another when it is done; how far it has come goes over the line before on a terminal.
 static void print_step_event(const struct json *body)
 {
@@ -160,14 +168,24 @@ static void print_step_event(const struct json *body)
     snprintf(last, sizeof(last), "%s", line);
 }
 
+// Of a program at work: over the line before on a terminal; in a file or a pipe a line when nothing was said of it for two seconds.
+static void print_how_far(const struct json *p)
+{
+    static int64_t next_ns;
+    const int64_t now = clock_ns();
+    if (!isatty(2) && now < next_ns)
+        return;
+    next_ns = now + 1800000000; // the next news may be late
+    fprintf(stderr, "  %s: %s %.0f of %.0f%s", text_of(p, "step"), text_of(p, "stage"), number_of(p, "done", 0), number_of(p, "total", 0), isatty(2) ? "\033[K\r" : "\n");
+}
+
 static void print_event(const struct json *message)
 {
     const char *event = text_of(message, "event");
     if (!strcmp(event, "processing"))
         print_step_event(json_get(message, "body"));
-    else if (!strcmp(event, "progress") && isatty(2))
-        fprintf(stderr, "  %s: %s %.0f of %.0f\033[K\r", text_of(message, "body.step"), text_of(message, "body.stage"), number_of(message, "body.done", 0),
-                number_of(message, "body.total", 0));
+    else if (!strcmp(event, "progress"))
+        print_how_far(json_get(message, "body"));
     if (!strcmp(event, "state"))
         fprintf(stderr, "  %s\n", text_of(message, "body.state"));
     else if (!strcmp(event, "say"))
@@ -549,6 +567,12 @@ static void print_report(const struct json *t)
         if (json_get(c, "developed"))
             printf("  %s clipped %.2f %%", text_of(c, "developed"), 100 * number_of(c, "clipped_share", 0));
         printf("%s%s\n", text_of(c, "note")[0] ? "  " : "", text_of(c, "note"));
+    }
+    if (json_length(t, "time_line") > 0)
+        printf("  time line, seconds after the button\n");
+    for (int i = 0; i < json_length(t, "time_line"); i++) {
+        const struct json *s = element(t, "time_line", i);
+        printf("    %-11s %8.2f .. %8.2f   took %8.2f\n", text_of(s, "stage"), number_of(s, "began_s", 0), number_of(s, "ended_s", 0), number_of(s, "took_s", 0));
     }
     for (int i = 0; i < json_length(t, "processing.solves"); i++) {
         const struct json *v = element(t, "processing.solves", i);

@@ -442,6 +442,7 @@ static void carry_out(struct workshop *w, const struct processing_action *a)
     static struct processing_record record;
     struct bench *b = find_bench(w, a->take);
     struct beginning *mark;
+    struct timespec utc;
     struct task *t;
     if (!b)
         return;
@@ -479,6 +480,8 @@ static void carry_out(struct workshop *w, const struct processing_action *a)
         return;
     case PROCESSING_RECORD:
         processing_record(w->processing, a->take, &record);
+        clock_gettime(CLOCK_REALTIME, &utc);
+        record.utc_offset_ms = (int64_t)utc.tv_sec * 1000 + utc.tv_nsec / 1000000 - now_ns() / 1000000;
         w->host.record(w->host.arg, a->take, &record);
         return;
     case PROCESSING_STATE:

@@ -17,7 +17,7 @@ struct joint_settings joint_defaults(enum method method)
 {
     return (struct joint_settings){ .method = method, .w_sim = method == METHOD_ALTERNATING ? 3e-9 : -1,
                                     .start_distance_m = method == METHOD_ALTERNATING ? 2 : 0, .visibility = method == METHOD_JOINT,
-                                    .continuation = true, .planes = method == METHOD_JOINT, .robust = false };
+                                    .continuation = true, .coarse_samples = 30000, .fine_samples = 200000, .planes = method == METHOD_JOINT, .robust = false };
 }
 
 const char *joint_doubt_text(unsigned one_bit)
@@ -74,15 +74,13 @@ static int merge_lights(struct lights *out, int32_t *group, const struct lights 
     return 0;
 }
 
-// Few are enough to follow the valley, more to tell one weight from the next and for the last word; the albedo is then
-// solved for every texel.
-enum { SWEEP_SAMPLES = 30000, COARSE_SAMPLES = 30000, FINE_SAMPLES = 200000 };
+enum { N_SWEPT = 5 };
 
 // The common distance of all lights, by brute trial at few texels: one group, so a Jacobian costs little.
 static int sweep(const struct photometric *p, const struct lights *lights, const struct rays *rays,
                  const struct joint_settings *set, struct photometric_state *best, double *best_cost, struct stage1 *total)
 {
-    static const double distances_m[] = { .7, 1.1, 1.7, 2.6, 4 };
+    static const double distances_m[N_SWEPT] = { .7, 1.1, 1.7, 2.6, 4 };
     int32_t *one_group = calloc((size_t)lights->n, sizeof(*one_group));
     struct photometric coarse = *p;
     struct stage1 s = { 0 };
@@ -91,8 +89,8 @@ static int sweep(const struct photometric *p, const struct lights *lights, const
     coarse.group_of_light = one_group;
     coarse.n_groups = 1;
     const struct stage1 all = { .p = *p };
-    coarse.texel_step = stage1_step_for(&all, SWEEP_SAMPLES);
-    const int n = set->start_distance_m > 0 ? 1 : (int)(sizeof(distances_m) / sizeof(distances_m[0]));
+    coarse.texel_step = stage1_step_for(&all, set->coarse_samples);
+    const int n = set->start_distance_m > 0 ? 1 : N_SWEPT;
     for (int k = 0; !err && k < n; k++) {
         double cost;
         err = stage1_new(&s, &coarse, lights, rays, set);
@@ -111,6 +109,7 @@ static int sweep(const struct photometric *p, const struct lights *lights, const
         total->n_jacobians += s.n_jacobians, total->n_evaluations += s.n_evaluations;
         total->n_sweep_jacobians += s.n_jacobians;
         stage1_free(&s);
+        progress_add(N_SWEPT / n);
     }
     free(one_group);
     return err;
@@ -152,10 +151,10 @@ static int put_on_planes(struct stage1 *s, const uint8_t *aside, const struct ph
     int err = 0;
     for (int k = 0; !err && k < 2; k++) {
         err = find_planes(s, plane_tolerance, plane_share * s->w_sim);
-        s->p.texel_step = stage1_step_for(s, COARSE_SAMPLES);
+        s->p.texel_step = stage1_step_for(s, s->set->coarse_samples);
         if (!err)
             err = stage1_minimise(s, 8, 2e-3, NULL);
-        s->p.texel_step = stage1_step_for(s, FINE_SAMPLES);
+        s->p.texel_step = stage1_step_for(s, s->set->fine_samples);
         if (!err)
             err = photometric_evaluate(&s->p, &s->base, s->p.albedo == ALBEDO_FREE, &e);
         if (!err)
@@ -182,11 +181,11 @@ static int continuation(struct stage1 *s, const uint8_t *aside)
     for (double w = s->set->continuation ? first_w_sim : last; !err && n < MAX_STEPS; w = w > 1e-13 ? w / 10 : 0) {
         struct photometric_error e;
         s->w_sim = weight[n] = w > last ? w : last;
-        s->p.texel_step = stage1_step_for(s, COARSE_SAMPLES);
+        s->p.texel_step = stage1_step_for(s, s->set->coarse_samples);
         err = stage1_trace_visibility(s);
         if (!err)
             err = stage1_minimise(s, 8, 2e-3, NULL);
-        s->p.texel_step = stage1_step_for(s, FINE_SAMPLES);
+        s->p.texel_step = stage1_step_for(s, s->set->fine_samples);
         if (!err) // the albedo of more texels, for the views set aside
             err = photometric_evaluate(&s->p, &s->base, s->p.albedo == ALBEDO_FREE, &e);
         if (!err)
@@ -236,7 +235,7 @@ static int refine(struct stage1 *s, const uint8_t *fit)
     float *weight = NULL;
     struct photometric_error e;
     s->p.use_view = fit;
-    s->p.texel_step = stage1_step_for(s, FINE_SAMPLES);
+    s->p.texel_step = stage1_step_for(s, s->set->fine_samples);
     int err = stage1_trace_visibility(s);
     if (!err && s->set->robust) {
         double sigma;
@@ -280,6 +279,7 @@ static int solve_joint(struct stage1 *s, const struct photometric *p, const stru
     if (err)
         goto end;
     coarse.group_of_light = group;
+    progress_begin("sweep", 2 * N_SWEPT);
     err = photometric_state_new(&start, &coarse, &one);
     if (!err)
         err = sweep(&coarse, &one, s->rays, s->set, &start, &cost, s);
@@ -294,6 +294,7 @@ static int solve_joint(struct stage1 *s, const struct photometric *p, const stru
         if (!err && mirrored_cost < .5 * cost)
             out->doubts |= DOUBT_MIRRORED;
     }
+    progress_end();
     if (err)
         goto end;
     photometric_pack(&coarse, &start, s->x);
@@ -337,7 +338,7 @@ int stage1_uncertainty(struct stage1 *s, struct joint_result *out)
     double *prior = calloc(n * n, sizeof(double)), deviation[n];
     struct photometric_error e;
     int err = prior ? 0 : -ENOMEM;
-    s->p.texel_step = stage1_step_for(s, FINE_SAMPLES);
+    s->p.texel_step = stage1_step_for(s, s->set->fine_samples);
     if (!err) {
         stage1_add_prior(s, prior);
         for (size_t i = 0; i < n; i++) // both triangles

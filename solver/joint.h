@@ -27,6 +27,8 @@ struct joint_settings {
     bool planes;             // joint: lights that lie on one plane, if the views set aside accept it, stay on it
     bool robust;             // down-weight outliers in the last stage
     bool gain;               // one unknown exposure factor per camera (prior 2 %)
+    int coarse_samples;      // joint: about so many in the sweep and the continuation (30,000): few are enough to follow the valley
+    int fine_samples;        // about so many to tell one weight from the next, and for the last word (200,000)
     int n_threads;
 };
 struct joint_settings joint_defaults(enum method method);

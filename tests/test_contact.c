@@ -149,6 +149,27 @@ static int set_up(void **state)
     return scratch_open();
 }
 
+// Black cloth behind, and the object large in some pictures, small in others: only the one that got a fifth of the light is dark.
+static void a_small_object_before_black_is_not_dark(void **state)
+{
+    (void)state;
+    static const double covered[N] = { .9, .8, .15, .9, .85, .3, .8, .08 };
+    struct contact_entry e[N];
+    struct image m;
+    memset(e, 0, sizeof(e));
+    for (int i = 0; i < N; i++) {
+        see(&m, 10, covered[i], .7, .004, i == 4 ? .2 : 1);
+        for (int p = 0; p < W * H; p++)
+            for (int c = 0; p % W >= covered[i] * W && c < 3; c++)
+                m.data[3 * p + c] *= .005f;
+        assert_int_equal(contact_measure(&e[i].figures, &m, true), 0);
+        image_free(&m);
+    }
+    contact_judge(e, N, true);
+    for (int i = 0; i < N; i++)
+        assert_int_equal(e[i].doubts & CONTACT_DARK, i == 4 ? CONTACT_DARK : 0);
+}
+
 static int tear_down(void **state)
 {
     (void)state;
@@ -160,6 +181,7 @@ int main(void)
     const struct CMUnitTest tests[] = {
         cmocka_unit_test(sharpness_is_of_the_lens_not_of_the_scene),
         cmocka_unit_test(the_soft_the_clipped_and_the_dark_are_named),
+        cmocka_unit_test(a_small_object_before_black_is_not_dark),
         cmocka_unit_test(two_cameras_are_not_compared_and_tiny_or_flat_pictures_are_not_judged),
     };
     return cmocka_run_group_tests(tests, set_up, tear_down);

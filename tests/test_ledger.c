@@ -453,6 +453,44 @@ static void exposures_are_called_as_on_dials(void **state)
     }
 }
 
+static void a_stage_made_anew_replaces_the_one_before_and_old_ledgers_have_none(void **state)
+{
+    (void)state;
+    struct config config;
+    struct ledger l, back;
+    make_config(&config);
+    ledger_init(&l, &config);
+    strcpy(l.id, "20260101T000000000_line");
+    strcpy(l.name, "line");
+    char *text = ledger_text(&l);
+    assert_null(strstr(text, "time_line"));
+    assert_int_equal(ledger_parse(&back, text, strlen(text), "test"), 0);
+    assert_int_equal(back.n_stages, 0);
+    ledger_free(&back);
+    free(text);
+    ledger_note_stage(&l, "button", 1000, 1250);
+    ledger_note_stage(&l, "preview", 2000, 9000);
+    ledger_note_stage(&l, "standard", 9000, 50000);
+    ledger_note_stage(&l, "preview", 60000, 66000);
+    text = ledger_text(&l);
+    assert_int_equal(ledger_parse(&back, text, strlen(text), "test"), 0);
+    assert_int_equal(back.n_stages, 3);
+    assert_string_equal(back.stage[1].name, "preview");
+    assert_int_equal(back.stage[1].began_utc_ms, 60000);
+    assert_int_equal(back.stage[1].ended_utc_ms, 66000);
+    assert_int_equal(back.stage[0].ended_utc_ms, 1250);
+    for (int i = 0; i < 2 * LEDGER_STAGES_MAX; i++) { // more than there is room for: the first ones stay
+        char name[16];
+        snprintf(name, sizeof(name), "s%d", i);
+        ledger_note_stage(&l, name, i, i);
+    }
+    assert_int_equal(l.n_stages, LEDGER_STAGES_MAX);
+    assert_string_equal(l.stage[0].name, "button");
+    free(text);
+    ledger_free(&back);
+    ledger_free(&l);
+}
+
 static void a_panorama_s_ledger_reads_back_as_it_was_written(void **state)
 {
     (void)state;
@@ -624,6 +662,7 @@ int main(void)
 {
     const struct CMUnitTest tests[] = {
         cmocka_unit_test(a_ledger_reads_back_as_it_was_written),
+        cmocka_unit_test(a_stage_made_anew_replaces_the_one_before_and_old_ledgers_have_none),
         cmocka_unit_test(a_panorama_s_ledger_reads_back_as_it_was_written),
         cmocka_unit_test(exposures_are_called_as_on_dials),
         cmocka_unit_test(killed_at_every_call_a_take_is_finished_by_the_next_start),

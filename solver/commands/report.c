@@ -231,7 +231,7 @@ static int show_views(struct page *p, const struct report_inputs *in)
         .albedo = &p->solved.albedo,
         .parameters = p->solved.parameters.data ? &p->solved.parameters : NULL,
     };
-    const struct render_settings settings = { .samples = 2, .shadows = true, .shadow_rays = SHADOW_RAYS, .n_threads = in->n_threads };
+    const struct render_settings settings = { .samples = in->quick ? 1 : 2, .shadows = true, .shadow_rays = in->quick ? 1 : SHADOW_RAYS, .n_threads = in->n_threads };
     struct renderer *renderer = NULL;
     struct rays *rays = NULL;
     int n_with = 0, err = 0;

@@ -9,6 +9,7 @@ struct report_inputs {
     const char *cameras, *images;   // beat the take's; NULL: report.json's inputs.cameras and inputs.images, else the take's
     const char *output;             // NULL: SOLVE_DIR/report.html
     int n_views, n_threads;
+    bool quick;                 // pictures of one ray a pixel
 };
 
 // Writes the page. Without cameras or photographs it has no pictures, which is said. 0, or -errno, logged but for -ENOMEM.

@@ -22,8 +22,22 @@
 #include <sys/resource.h>
 #include <time.h>
 
+// What the presets are. A preview is for the eyes of those who could still shoot again: lights in 64 groups, shared material, few samples.
+static const struct preset {
+    const char *name;
+    int last_stage, texture, texture_stage1; // texture_stage1: with --stage 1
+    int n_lights, coarse_samples, fine_samples;
+    int page_views;
+    bool quick_page;
+} presets[] = {
+    { "preview", 1, 128, 128, 64, 12000, 60000, 2, true },
+    { "standard", 2, 512, 256, 256, 30000, 200000, 4, false },
+    { "final", 2, 2048, 512, 256, 30000, 200000, 4, false },
+};
+
 struct settings {
-    const char *out, *preset, *hold_out;
+    const char *out, *hold_out;
+    const struct preset *preset;
     struct joint_settings joint;
     struct solve_materials materials;
     double w_sim;
@@ -42,10 +56,10 @@ enum {
 
 static const struct argp_option options[] = {
     { 0, 0, 0, 0, "Method", 2 },
-    { "preset", OPTION_PRESET, "NAME", 0, "preview (stage 1, texture 128), standard (512, default) or final (2048); with --stage 1: 128, 256, 512", 2 },
+    { "preset", OPTION_PRESET, "NAME", 0, "preview (stage 1, texture 128, 64 lights, in seconds), standard (512, default) or final (2048); with --stage 1: 128, 256, 512", 2 },
     { "method", OPTION_METHOD, "NAME", 0, "joint (default), alternating (the paper) or directional", 2 },
     { "texture", OPTION_TEXTURE, "N", 0, "N x N texels", 2 },
-    { "lights", OPTION_LIGHTS, "N", 0, "lights with a distance of their own, a power of two (256)", 2 },
+    { "lights", OPTION_LIGHTS, "N", 0, "lights with a distance of their own, a power of two (256; preview: 64)", 2 },
     { "sub-lights", OPTION_SUB_LIGHTS, "K", 0, "each light is K lights of one distance, a power of two (joint: 4; else 1)", 2 },
     { "reflectance", OPTION_REFLECTANCE, "NAME", 0, "disney (default) or lambert", 2 },
     { "albedo", OPTION_ALBEDO, "free|shared|VALUE", 0, "per texel (default), one unknown colour, or known", 2 },
@@ -76,7 +90,7 @@ static const char doc[] =
 
 static error_t parse_option(int key, char *text, struct argp_state *state)
 {
-    static const char *const presets[] = { "preview", "standard", "final" }, *const models[] = { "disney", "lambert" };
+    static const char *const preset_names[] = { "preview", "standard", "final" }, *const models[] = { "disney", "lambert" };
     struct settings *s = state->input;
     switch (key) {
     case ARGP_KEY_INIT:
@@ -84,7 +98,7 @@ static error_t parse_option(int key, char *text, struct argp_state *state)
         state->child_inputs[1] = &s->materials;
         return 0;
     case OPTION_PRESET:
-        s->preset = presets[argument_choice(state, "--preset", text, presets, 3)];
+        s->preset = &presets[argument_choice(state, "--preset", text, preset_names, 3)];
         return 0;
     case OPTION_METHOD:
         s->joint.method = (enum method)argument_choice(state, "--method", text, method_names, 3);
@@ -293,7 +307,7 @@ static void set_path(struct json *inputs, const char *key, const char *path)
 static int write_for_others(const struct settings *s)
 {
     struct export_summary exported;
-    const struct report_inputs page = { .solve_dir = s->out, .n_views = 4, .n_threads = s->n_threads };
+    const struct report_inputs page = { .solve_dir = s->out, .n_views = s->preset->page_views, .quick = s->preset->quick_page, .n_threads = s->n_threads };
     const int err = export_folder(&exported, s->out, NULL, s->out, EXPORT_GLB | EXPORT_MTLX, s->n_threads);
     return err ? err : report_folder(&page);
 }
@@ -306,7 +320,7 @@ static struct json *make_report(const struct scene *scene, const struct settings
     struct json *o = json_object(), *warnings = json_array(), *inputs = json_object(), *stages = json_object(),
                 *stage1 = json_object();
     json_set_string(o, "method", method_names[s->joint.method]);
-    json_set_string(o, "preset", s->preset);
+    json_set_string(o, "preset", s->preset->name);
     json_set_int(o, "seed", (int64_t)s->seed);
     json_set_int(o, "threads", s->n_threads > 0 ? s->n_threads : parallel_n_cores());
     json_set_number(o, "wall_s", wall);
@@ -428,7 +442,7 @@ int command_solve(int argc, char **argv)
     const struct argp_child children[] = { { &inputs_argp, 0, NULL, 0 }, { &solve_materials_argp, 0, NULL, 0 }, { 0 } };
     const struct argp argp = { options, parse_option, "TAKE -o DIR\n--mesh M --cameras C --images DIR --panorama P -o DIR", doc,
                                children, 0, 0 };
-    struct settings s = { .preset = "standard", .n_lights = 256, .hold_out = "every:7", .seed = 1 };
+    struct settings s = { .preset = &presets[1], .hold_out = "every:7", .seed = 1 };
     struct scene scene = { 0 };
     struct joint_result result = { 0 };
     struct materials materials = { 0 };
@@ -444,12 +458,15 @@ int command_solve(int argc, char **argv)
     s.joint.n_threads = s.n_threads;
     s.materials.no_visibility = s.no_visibility;
     if (!s.materials.last_stage)
-        s.materials.last_stage = s.materials.lights_from || strcmp(s.preset, "preview") ? 2 : 1;
+        s.materials.last_stage = s.materials.lights_from ? 2 : s.preset->last_stage;
+    if (!s.n_lights)
+        s.n_lights = s.preset->n_lights;
+    s.joint.coarse_samples = s.preset->coarse_samples;
+    s.joint.fine_samples = s.preset->fine_samples;
     if (!s.n_sub)
         s.n_sub = s.joint.method == METHOD_JOINT ? 4 : 1;
     if (!s.texture)
-        s.texture = !strcmp(s.preset, "preview") ? 128
-                    : !strcmp(s.preset, "final") ? (s.materials.last_stage == 2 ? 2048 : 512) : s.materials.last_stage == 2 ? 512 : 256;
+        s.texture = s.materials.last_stage == 2 ? s.preset->texture : s.preset->texture_stage1;
     int err = load(&scene, &s);
     const double stage_begin = wall_s();
     if (!err && s.materials.lights_from)

@@ -1,4 +1,4 @@
-// solver/take/progress.c - a bar for people, JSON lines for rigd, silence otherwise.
+// solver/take/progress.c - a bar for people, a line now and then for logs, JSON lines for rigd.
 #include "solver/take/progress.h"
 
 #include <errno.h>
@@ -13,14 +13,14 @@
 #include <unistd.h>
 
 enum { BAR_CELLS = 24 };
-static const int64_t REDRAW_NS = 100000000;
+static const int64_t REDRAW_NS = 100000000, SILENCE_NS = 1800000000; // the next tick may be late
 
 static pthread_mutex_t lock = PTHREAD_MUTEX_INITIALIZER;
 static int json_fd = -1;
 static bool asked_environment;
 static bool on_terminal;
 static const char *stage; // NULL: none
-static int64_t total, begin_ns;
+static int64_t total, begin_ns, next_line_ns;
 static _Atomic int64_t done, next_draw_ns;
 
 static int64_t now_ns(void)
@@ -84,8 +84,9 @@ static void draw(int64_t now)
         if (length > 0 && (size_t)length < sizeof(line))
             write_json_line(line, (size_t)length);
     }
-    if (!on_terminal)
+    if (!on_terminal && (json_fd >= 0 || now < next_line_ns))
         return;
+    next_line_ns = now + SILENCE_NS;
     double share = total > 0 ? (double)n / (double)total : 0;
     share = share < 0 ? 0 : share > 1 ? 1 : share;
     char bar[BAR_CELLS + 1], elapsed[32], left[32] = "-:--";
@@ -95,6 +96,10 @@ static void draw(int64_t now)
     format_time(elapsed, sizeof(elapsed), seconds);
     if (share > 0)
         format_time(left, sizeof(left), seconds * (1 - share) / share);
+    if (!on_terminal) {
+        fprintf(stderr, "%s: %d %% after %s, %s left\n", stage, (int)(share * 100), elapsed, left);
+        return;
+    }
     fprintf(stderr, "\r\033[K%s [%s] %3d%%  %s elapsed, %s left", stage, bar, (int)(share * 100),
             elapsed, left);
     fflush(stderr);
@@ -117,6 +122,7 @@ void progress_begin(const char *name, int64_t n)
     stage = name;
     total = n;
     begin_ns = now_ns();
+    next_line_ns = next_line_ns ? next_line_ns : begin_ns + SILENCE_NS; // over all stages
     on_terminal = isatty(STDERR_FILENO);
     atomic_store(&done, 0);
     atomic_store(&next_draw_ns, begin_ns + REDRAW_NS);
@@ -141,7 +147,8 @@ void progress_end(void)
 {
     pthread_mutex_lock(&lock);
     if (stage) {
-        draw(now_ns());
+        if (on_terminal || json_fd >= 0)
+            draw(now_ns());
         if (on_terminal)
             fputs("\r\033[K", stderr);
         stage = NULL;
