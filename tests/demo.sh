@@ -52,9 +52,9 @@ elif [ "$n_cameras" -gt 0 ]; then
     studio=$out/studio
     step "studio: $n_cameras views of one Disney material in a room lit by 16,384 small lights, with a known answer (data set D3)"
     # A panorama whose texels are as large as what the fisheye resolves: smaller ones could not be photographed in their place.
-    size=720x480 panorama_px=512
-    [ "$n_cameras" -le 24 ] || size=480x320 panorama_px=256
-    "$rigsolve" synth D3 -o "$studio" --size $size --views "$n_cameras" --true-lights 16384 --panorama-width $panorama_px --seed 1 --samples 2
+    size=720x480
+    [ "$n_cameras" -le 24 ] || size=480x320
+    "$rigsolve" synth D3 -o "$studio" --size $size --views "$n_cameras" --true-lights 16384 --panorama-width 512 --seed 1 --samples 2
 else
     studio=$out/take
     step "studio: 85 views of one Disney material in a room lit by 16,384 small lights, with a known answer (data set D3)"
@@ -81,7 +81,13 @@ place_cameras() {
         points { points = 0; if (keep) print ""; next }
         { view = $10; sub(/^.*\//, "", view); sub(/\.[^.]*$/, "", view); keep = view in name; points = 1; $10 = name[view] ".exr"; if (keep) print }' \
         "$out/cameras.txt" "$studio/geometry/cameras/images.txt" >"$out/fixed/cameras/images.txt"
-    size_px=$(awk '!/^#/ && NF { print $3 "x" $4; exit }' "$studio/geometry/cameras/cameras.txt")
+    # Of other people's pictures sensors are twice as fine: a photosite has one colour, and real ones are finer than what is asked of them.
+    finer=1
+    [ -z "$scene" ] || finer=2
+    size_px=$(awk -v k=$finer '!/^#/ && NF { print k * $3 "x" k * $4; exit }' "$studio/geometry/cameras/cameras.txt")
+    if [ -f "$studio/unseen.txt" ]; then
+        awk 'FNR == NR { name[$1 ".exr"] = $2; next } $1 in name { print name[$1] ".exr" }' "$out/cameras.txt" "$studio/unseen.txt" >"$out/unseen.txt"
+    fi
 }
 
 write_config() { # simulated|usb
@@ -98,7 +104,7 @@ free_space_mb = 200
 imageformat = raw
 iso = 100
 aperture = 8
-shutter = 1/60
+shutter = $shutter
 [develop]
 after = on
 [reconstruct]
@@ -117,7 +123,7 @@ E
         section == "[camera" && kind == "usb" && /^relay_line/ { $3 += 16 * registers }
         section == "[panorama]" && /^head/ && kind == "usb" { $3 = "manual" }
         { print }
-        /^\[panorama\]/ { print "neutral_density_ev = 4\nstops = 0,0; 180,0\nmeter = 1/60\nlongest = 1/4\nsettle_ms = 200" }'
+        /^\[panorama\]/ { print "neutral_density_ev = 4\nstops = 0,-20; 120,-20; 240,-20; 0,90\nmeter = 1/60\nlongest = 1/4\nsettle_ms = 200" }'
 }
 
 start_rigd() { # config, then the words before rigd
@@ -156,12 +162,30 @@ pressed() { # a take that was not there before has all its frames
 newest() { ls -d "$out"/takes/*_"$1" | tail -n 1; }
 state_of() { grep -o '"state": *"[a-z]*"' "$1/take.json" | head -n 1 | cut -d'"' -f4; }
 
+# As in any studio: test shots, a stop less each, until only glints and lamps in view are at white.
+choose_shutter() {
+    for shutter in 1/60 1/125 1/250 1/500 1/1000; do
+        sed "s|^shutter = .*|shutter = $shutter|; s/^after = on/after = off/" "$out/rigd.conf" >"$out/rigd-test.conf"
+        start_rigd "$out/rigd-test.conf" || fail "the cameras did not come up: see $out/rigd.log and $out/rigsim.log"
+        rigctl capture --name test >/dev/null || fail "no test shot: see $out/rigd.log"
+        stop_rigd
+        "$bin/rigd-contact" "$(newest test)" -o "$out/test.png" >/dev/null
+        headroom=$(number "$out/test.json" headroom_ev)
+        echo "a test shot at $shutter s: $headroom EV to white in four of five cameras, where the subject is"
+        ! awk -v ev="$headroom" 'BEGIN { exit ev < .25 }' || break
+    done
+    sed -i "s|^shutter = .*|shutter = $shutter|" "$out/rigd.conf" "$out/rigd-board.conf"
+}
+
 use_rig() {
     place_cameras
     port=$((10000 + $$ % 200 * 100))
-    simulate="$bin/rigsim --cameras $((n_cameras + 1)) --personality nikon --port $port --seed 1 --raw-size $size_px --scene $out/scene --panorama $studio/panorama.exr --panorama-gain 0.0625 --trigger-socket $wires/wires"
-    solve_options="--texture $texture --hold-out every:6"
+    simulate="$bin/rigsim --cameras $((n_cameras + 1)) --personality nikon --port $port --seed 1 --raw-size $size_px --scene $out/scene --panorama $studio/panorama.exr --panorama-gain 0.0625 --panorama-raw-size 1440x960 --trigger-socket $wires/wires"
+    hold_out=every:6
+    [ ! -s "$out/unseen.txt" ] || hold_out=list:$out/unseen.txt
+    solve_options="--texture $texture --hold-out $hold_out"
     export RIGD_SOCKET="$wires/rigd"
+    shutter=1/60
     write_config simulated >"$out/rigd.conf"
     write_config usb >"$out/rigd-board.conf"
 
@@ -169,10 +193,11 @@ use_rig() {
     $simulate >"$out/rigsim.log" 2>&1 &
     sim=$!
     while [ ! -S "$wires/wires" ]; do kill -0 "$sim" 2>/dev/null || fail "the cameras did not start: see $out/rigsim.log"; sleep .1; done
+    [ -z "$scene" ] || choose_shutter
     start_rigd "$out/rigd.conf" || fail "the cameras did not come up: see $out/rigd.log and $out/rigsim.log"
     echo "$((n_cameras + 1)) of $((n_cameras + 1)) cameras are ready"
 
-    step "panorama: a fisheye on a head sees the studio's lights in two stops; each is bracketed until no light clips, then merged"
+    step "panorama: a fisheye on a head sees the studio's lights in four stops; each is bracketed until no light clips, then merged"
     rigctl panorama --name lights || fail "no panorama: see $out/rigd.log"
     rigctl process "$(basename "$(newest lights)")" --watch || [ $? -eq 3 ] || fail "the panorama was not merged: see $(newest lights)/log"
 
@@ -230,7 +255,7 @@ no_rig() {
     "$rigsolve" solve "$studio" -o "$solve" --texture 256 || [ $? -eq 3 ] || fail "the solve failed"
 }
 
-texture=128
+texture=${RIG_TEXTURE:-128}
 if [ "$n_cameras" -gt 0 ]; then use_rig; else no_rig; fi
 
 # ---- how good is it -----------------------------------------------------------------------------------------------------------
