@@ -9,10 +9,10 @@
 #include <stdlib.h>
 #include <string.h>
 
-enum { BLOCK_PX = 16, STRONGEST_OF = 8, FLATTEST_OF = 4, BLOCKS_MIN = 24, HISTOGRAM = 4096, GLYPH_PX = 3, LABEL_PX = 24, GAP_PX = 6 };
+enum { BLOCK_PX = 16, STRONGEST_OF = 8, FLATTEST_OF = 4, BLOCKS_MIN = 24, HISTOGRAM = 4096, GLYPH_PX = 3, LABEL_PX = 24, GAP_PX = 6, EXCEPT_ONE_OF = 5 };
 static const double soft_below = .5, dark_below_ev = -1.5, dark_p99 = .02;
 static const double full_white = .985; // 253 of 255, the curve undone
-static const double glints = .02, headroom_of = .8;
+static const double glints = .02;
 
 // ---- figures ------------------------------------------------------------------------------------------------------------------
 
@@ -183,7 +183,7 @@ double contact_headroom(const struct contact_entry *e, int n)
         if (!isnan(e[i].figures.headroom_ev))
             v[n_known++] = e[i].figures.headroom_ev;
     qsort(v, (size_t)n_known, sizeof(*v), compare_doubles);
-    const double headroom = n_known ? v[(int)((1 - headroom_of) * n_known)] : NAN;
+    const double headroom = n_known ? v[n_known / EXCEPT_ONE_OF] : NAN;
     free(v);
     return headroom;
 }
