@@ -262,28 +262,33 @@ if [ "$n_cameras" -gt 0 ]; then use_rig; else no_rig; fi
 step "judged: the solved material as the cameras see it that were set aside, beside their pictures; then under lights that the solve has never seen"
 mkdir "$out/aside" # cameras of views that the solver did not fit
 cp "$cameras"/cameras.txt "$cameras"/points3D.txt "$out/aside/"
-tr -d ' \n"' <"$solve/report.json" | sed -n 's/.*views_held_out:\[\([^]]*\)\].*/\1/p' | tr ',' '\n' | sed 's/\.exr$//' >"$out/views-aside"
+tr -d ' \n"' <"$solve/report.json" | sed -n 's/.*views_held_out:\[\([^]]*\)\].*/\1/p' | tr ',' '\n' | sed 's/\.exr$//' >"$out/views-all-aside"
+awk '{ v[NR] = $0 } END { n = NR < 6 ? NR : 6; for (i = 0; i < n; i++) print v[int(i * NR / n) + 1] }' "$out/views-all-aside" >"$out/views-aside" # six are pictures enough
 awk 'FNR == NR { is_aside[$1] = 1; next } /^#/ { next } points { points = 0; if (keep) print ""; next }
     { view = $10; sub(/\.[^.]*$/, "", view); keep = view in is_aside; points = 1; if (keep) print }' "$out/views-aside" "$cameras/images.txt" >"$out/aside/images.txt"
 # To be compared is where the object is: pixels that get any light of a few lamps.
-mask() { # cameras, panorama, JSON with its pose, folder to make
-    "$rigsolve" render "$solve" --cameras "$1" --panorama "$2" --world-from-probe "$3" -n 32 --no-shadows --samples 1 --exposure 20 -o "$4" >/dev/null
+mask() { # cameras, panorama, JSON with its pose, folder to make, option
+    # shellcheck disable=SC2086
+    "$rigsolve" render "$solve" --cameras "$1" --panorama "$2" --world-from-probe "$3" -n 32 --no-shadows --samples 1 --exposure 20 -o "$4" $5 >/dev/null
     rm -f "$4"/*.exr
 }
-"$rigsolve" render "$solve" --cameras "$out/aside" -o "$out/views" --no-shadows
-mask "$out/aside" "$panorama" "$solve/report.json" "$out/masks"
+as_taken=
+[ -z "${size_px-}" ] || as_taken="--size $size_px"
+# shellcheck disable=SC2086
+"$rigsolve" render "$solve" --cameras "$out/aside" -o "$out/views" --no-shadows $as_taken
+mask "$out/aside" "$panorama" "$solve/report.json" "$out/masks" "$as_taken"
 "$rigsolve" compare --mask "$out/masks" "$out/views" "$images" >"$out/compare.txt" 2>"$out/compare.log"
 figure() { sed -n '$s/.*RMSE  *\([0-9.]* %\)  *PSNR  *\([0-9.]* dB\).*/\1 (\2)/p' "$1"; }
 {
     printf 'views set aside, where texels are      RMSE %.3f %%   (fitted views %.3f %%)\n' "$(number "$solve/report.json" rmse_held_out_percent)" "$(number "$solve/report.json" rmse_fit_percent)"
-    printf 'the same, whole object with its edges  RMSE %s\n' "$(figure "$out/compare.txt")"
+    printf '%s of them, whole object with its edges RMSE %s\n' "$(wc -l <"$out/views-aside")" "$(figure "$out/compare.txt")"
 } >"$out/figures.txt"
 if [ -f "$studio/relit/probe.json" ]; then
     panels=$studio/relit/panels.json
     [ -f "$panels" ] || panels=$studio/relit/lights.json
     "$rigsolve" render "$solve" --cameras "$studio/relit/cameras" --panorama "$studio/relit/panorama.exr" --world-from-probe "$studio/relit/probe.json" --panels "$panels" -n 512 \
         -o "$out/relit" >/dev/null 2>&1
-    mask "$studio/relit/cameras" "$studio/relit/panorama.exr" "$studio/relit/probe.json" "$out/masks-relit"
+    mask "$studio/relit/cameras" "$studio/relit/panorama.exr" "$studio/relit/probe.json" "$out/masks-relit" ''
     "$rigsolve" compare --mask "$out/masks-relit" "$out/relit" "$studio/relit/linear" >"$out/relit.txt"
     printf 'under other lights (512 of them)       RMSE %s\n' "$(figure "$out/relit.txt")" >>"$out/figures.txt"
 fi

@@ -101,7 +101,7 @@ row() { # NAME
     awk -v prefix="$name,$1,$(of method | tr -d '"'),$(of trusted),$(of rmse_fit_percent),$(of rmse_held_out_percent),$(sed -n 's/^relit: RMSE \([0-9.]*\) %/\1/p' "$out/$1.regions"),$(of centre_cm),$(of distance_percent),$(of distance_median_percent),$(of distance_weighted_percent),$cpu" '
         function put() { if (region != "") print prefix "," region "," albedo "," p["roughness"] "," p["metallic"] "," p["specular"] }
         /^region/ { put(); region = $2; sub(":", "", region); albedo = ""; next }
-        $1 == "albedo" && $2 == "true" { albedo = $8; gsub(/[()%]/, "", albedo) }
+        $1 == "albedo" && $2 == "true" { albedo = $9; gsub(/[()%]/, "", albedo) }
         $2 == "true" { p[$1] = $3 "," $5 "," $8 }
         END { put() }' "$out/$1.regions"
     rm "$out/row"
