@@ -172,7 +172,7 @@ choose_shutter() {
         stop_rigd
         "$bin/rigd-contact" "$(newest test)" -o "$out/test.png" >/dev/null
         headroom=$(number "$out/test.json" headroom_ev)
-        echo "a test shot at $shutter s: $headroom EV to white in four of five cameras, where the subject is"
+        printf 'a test shot at %s s: %.2f EV to white in four of five cameras, where the subject is\n' "$shutter" "$headroom"
         ! awk -v ev="$headroom" 'BEGIN { exit ev < .25 }' || break
     done
     sed -i "s|^shutter = .*|shutter = $shutter|" "$out/rigd.conf" "$out/rigd-board.conf"

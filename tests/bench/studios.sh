@@ -124,11 +124,12 @@ done
 mv "$csv.part" "$csv"
 
 # What a person reads: one line per variant and region.
-awk -F, 'FNR == 1 { next }
+awk -F, 'function short(x) { return x == "null" ? "-" : sprintf("%.2f", x) }
+    FNR == 1 { next }
     $1 != studio { studio = $1; printf "\n%s\n%-21s %6s %6s %6s %6s %8s %14s   %s\n", $1, "variant", "fit %", "unseen", "relit", "centre", "distance", "median, by flux", "region: albedo %, roughness/metallic/specular found (RMS error) of true" }
     { same = $1 $2 == last; last = $1 $2
       if (same) printf "%-21s %6s %6s %6s %6s %8s %14s", "", "", "", "", "", "", ""
-      else printf "%-21s %6.3f %6.3f %6.3f %6.2f %8.2f %6.2f %7.2f", $2 ($4 == "true" ? "" : " (!)"), $5, $6, $7, $8, $9, $10, $11
+      else printf "%-21s %6.3f %6.3f %6.3f %6s %8s %6s %7s", $2 ($4 == "true" ? "" : " (!)"), $5, $6, $7, short($8), short($9), short($10), short($11)
       printf "   %s: %5.2f  %.3f (%.3f) of %.2f  %.3f (%.3f) of %.2f  %.3f (%.3f) of %.2f\n", $13, $14, $16, $17, $15, $19, $20, $18, $22, $23, $21 }' "$csv"
 echo
 echo "(!): the solver does not trust its result and says why in its report. centre in cm, distance in %. Table: $csv"
