@@ -107,7 +107,7 @@ row() { # NAME
     rm "$out/row"
 }
 
-echo 'studio,variant,method,trusted,rmse_fit_percent,rmse_held_out_percent,relit_percent,centre_cm,distance_percent,distance_median_percent,distance_weighted_percent,cpu_s,region,albedo_percent,roughness_true,roughness,roughness_rms,metallic_true,metallic,metallic_rms,specular_true,specular,specular_rms' >"$csv.part"
+echo 'studio,variant,method,trusted,rmse_fit_percent,rmse_held_out_percent,relit_percent,centre_cm,distance_percent,distance_median_percent,distance_weighted_percent,cpu_s,region,albedo_percent,roughness_true,roughness,roughness_rms,metallic_true,metallic,metallic_rms,specular_true,specular,specular_rms' >"$csv.$$"
 for studio; do
     [ -d "$studio/truth" ] && [ -d "$studio/linear" ] || { echo "studios: $studio: expected a folder with linear/ and truth/" >&2; exit 2; }
     studio=$(cd "$studio" && pwd)
@@ -118,10 +118,10 @@ for studio; do
         [ -n "${TABLE-}" ] || [ -f "$out/$v/report.json" ] || make_variant "$v"
         [ -f "$out/$v/report.json" ] || continue
         judge "$v"
-        row "$v" >>"$csv.part"
+        row "$v" >>"$csv.$$"
     done
 done
-mv "$csv.part" "$csv"
+mv "$csv.$$" "$csv"
 
 # What a person reads: one line per variant and region.
 awk -F, 'function short(x) { return x == "null" ? "-" : sprintf("%.2f", x) }
