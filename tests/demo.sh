@@ -115,8 +115,8 @@ preview = on
 then = standard
 options = $solve_options
 E
-    # The studio's panels are far brighter than white: a filter of 4 stops in front of the fisheye, as in a real studio.
-    $simulate --list | awk -v kind="$1" -v n=$((n_cameras + 1)) '
+    # The studio's panels are far brighter than white: a filter in front of the fisheye, as in a real studio.
+    $simulate --list | awk -v kind="$1" -v nd=$nd_ev -v longest=$longest -v n=$((n_cameras + 1)) '
         BEGIN { registers = int((n + 7) / 8) }
         /^\[/ { section = $1 }
         section == "[trigger]" && kind == "usb" { if (/^\[/) print "[trigger]\nkind = usb\noutput_registers = " 3 * registers "\nhalf_press_ms = 500\nhold_ms = 150\nmax_hold_ms = 3000"; next }
@@ -124,7 +124,7 @@ E
         section == "[camera" && kind == "usb" && /^relay_line/ { $3 += 16 * registers }
         section == "[panorama]" && /^head/ && kind == "usb" { $3 = "manual" }
         { print }
-        /^\[panorama\]/ { print "neutral_density_ev = 4\nstops = 0,-20; 120,-20; 240,-20; 0,90\nmeter = 1/60\nlongest = 1/4\nsettle_ms = 200" }'
+        /^\[panorama\]/ { print "neutral_density_ev = " nd "\nstops = 0,-20; 120,-20; 240,-20; 0,90\nmeter = 1/60\nlongest = " longest "\nsettle_ms = 200" }'
 }
 
 start_rigd() { # config, then the words before rigd
@@ -181,7 +181,9 @@ choose_shutter() {
 use_rig() {
     place_cameras
     port=$((10000 + $$ % 200 * 100))
-    simulate="$bin/rigsim --cameras $((n_cameras + 1)) --personality nikon --port $port --seed 1 --raw-size $size_px --scene $out/scene --panorama $studio/panorama.exr --panorama-gain 0.0625 --panorama-raw-size 1440x960 --trigger-socket $wires/wires"
+    nd_ev=4 longest=1/4 panorama_gain=0.0625
+    [ -z "$scene" ] || nd_ev=6 longest=1 panorama_gain=0.015625 # photographed studios have lamps hundreds of times as bright as white
+    simulate="$bin/rigsim --cameras $((n_cameras + 1)) --personality nikon --port $port --seed 1 --raw-size $size_px --scene $out/scene --panorama $studio/panorama.exr --panorama-gain $panorama_gain --panorama-raw-size 1440x960 --trigger-socket $wires/wires"
     hold_out=every:6
     [ ! -s "$out/unseen.txt" ] || hold_out=list:$out/unseen.txt
     solve_options="--texture $texture --hold-out $hold_out"
