@@ -53,10 +53,10 @@ FUZZED := $(LIBRARY) $(RIG) $(RIGSIM_LIB) $(FIRMWARE_SIM) # what a fuzzer calls 
 
 # ---- rules --------------------------------------------------------------------------------------------------------------
 object = $(patsubst %.c,$(BUILD)/obj/%.o,$(1))
-ifneq ($(filter firmware test test-vm demo bench bench-chain bench-develop bench-firmware bench-panorama bench-rig chart figure5 figures stability experiments,$(MAKECMDGOALS)),)
+ifneq ($(filter firmware test test-vm demo bench bench-chain bench-develop bench-firmware bench-panorama bench-rig bench-studios chart figure5 figures stability experiments,$(MAKECMDGOALS)),)
 FIRST := deps # these install what is missing before the first file is compiled
 endif
-.PHONY: all firmware deps deps-test deps-fuzz deps-bench test test-vm demo bench bench-chain bench-develop bench-firmware bench-panorama bench-rig chart figure5 figures stability experiments fuzz check-includes man install clean help
+.PHONY: all firmware deps deps-test deps-fuzz deps-bench test test-vm demo bench bench-chain bench-develop bench-firmware bench-panorama bench-rig bench-studios chart figure5 figures stability experiments fuzz check-includes man install clean help
 .DELETE_ON_ERROR:
 .SECONDARY:
 
@@ -216,6 +216,9 @@ bench-chain: deps all
 	@BIN=$(BUILD)/bin perl tests/bench/chain_kills.pl $(CHAIN_KILLS)
 bench-develop: deps all $(BUILD)/tests/bench/raws
 	@BIN=$(BUILD)/bin RAWS=$(BUILD)/tests/bench/raws sh tests/bench/develop.sh
+STUDIOS ?= $(wildcard ../shared/data/studio-pebble ../shared/data/studio-vase)
+bench-studios: deps all $(addprefix $(BUILD)/tests/bench/,judge judge_materials raws)
+	@BIN=$(BUILD)/bin TOOLS=$(BUILD)/tests/bench sh tests/bench/studios.sh $(STUDIOS)
 experiments: deps $(BUILD)/bin/rigsolve $(BUILD)/tests/bench/judge
 	@BIN=$(BUILD)/bin JUDGE=$(BUILD)/tests/bench/judge sh tests/bench/experiments.sh
 chart: deps deps-bench $(BUILD)/tests/bench/chart_lights
@@ -287,6 +290,7 @@ help:
 	@echo 'make bench-panorama  what a merged panorama loses of the one that was photographed, and what 24 megapixels take'
 	@echo 'make bench-rig  the rig with simulated cameras: kills, faults, scale, soak, lag, disks (half an hour; RIG_BENCHES="lag soak")'
 	@echo 'make bench-chain  kill -9 of any process from the cameras to the solve, then every byte is looked at (CHAIN_KILLS="100 20": in 20 rounds)'
+	@echo 'make bench-studios  what the whole chain loses of studios whose answer is known, stage by stage (STUDIOS="FOLDER...")'
 	@echo 'make bench-develop  raws to radiance: seconds and MB per 24-megapixel frame, 85 of them sustained'
 	@echo 'make install    DESTDIR= PREFIX=/usr/local        make deps      Debian packages             make clean'
 	@echo 'variants: VARIANT=debug|asan|tsan; V=1 shows commands'

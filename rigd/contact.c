@@ -9,8 +9,10 @@
 #include <stdlib.h>
 #include <string.h>
 
-enum { BLOCK_PX = 16, STRONGEST_OF = 8, FLATTEST_OF = 4, BLOCKS_MIN = 24, HISTOGRAM = 4096, GLYPH_PX = 3, LABEL_PX = 24, GAP_PX = 6 };
-static const double soft_below = .5, clipped_above = .01, dark_below_ev = -1.5, dark_p99 = .02;
+enum { BLOCK_PX = 16, STRONGEST_OF = 8, FLATTEST_OF = 4, BLOCKS_MIN = 24, HISTOGRAM = 4096, GLYPH_PX = 3, LABEL_PX = 24, GAP_PX = 6, EXCEPT_ONE_OF = 5 };
+static const double soft_below = .5, dark_below_ev = -1.5, dark_p99 = .02;
+static const double full_white = .985; // 253 of 255, the curve undone
+static const double glints = .02;
 
 // ---- figures ------------------------------------------------------------------------------------------------------------------
 
@@ -82,28 +84,41 @@ static int measure_sharpness(double *out, const struct image *m)
     return 0;
 }
 
+static int step_of(double value)
+{
+    const double at = 128 * (log2(value) + 16);
+    return at < 0 ? 0 : at >= HISTOGRAM ? HISTOGRAM - 1 : (int)at;
+}
+
 int contact_measure(struct contact_figures *out, const struct image *m, bool full_is_one)
 {
     const int clip = image_channel(m, "clip");
     const size_t n = (size_t)m->width * (size_t)m->height;
-    size_t n_clipped = 0, n_lit = 0, seen = 0, *histogram;
-    *out = (struct contact_figures){ .sharpness = NAN };
+    size_t n_clipped = 0, n_middle = 0, n_middle_clipped = 0, n_lit = 0, seen = 0, *histogram, *brightest;
+    const bool knows_full = full_is_one && clip < 0;
+    *out = (struct contact_figures){ .sharpness = NAN, .headroom_ev = NAN };
     if (m->n_channels < 1 || !n)
         return -EINVAL;
-    histogram = calloc(HISTOGRAM, sizeof(*histogram)); // 2^-16 .. 2^16, 128 steps per EV
+    histogram = calloc(2 * HISTOGRAM, sizeof(*histogram)); // 2^-16 .. 2^16, 128 steps per EV; then of the middle's brightest channel
     if (!histogram)
         return -ENOMEM;
+    brightest = histogram + HISTOGRAM;
     for (size_t i = 0; i < n; i++) {
         const float *p = m->data + i * (size_t)m->n_channels;
         const double l = luminance(m, p);
-        bool full = false;
-        for (int c = 0; full_is_one && clip < 0 && c < (m->n_channels < 3 ? 1 : 3); c++)
-            full |= p[c] >= .985f; // 253 of 255, the curve undone
-        n_clipped += clip >= 0 ? p[clip] > .5f : full;
+        const int x = (int)(i % (size_t)m->width), y = (int)(i / (size_t)m->width);
+        const bool is_middle = 3 * x >= m->width && 3 * x < 2 * m->width && 3 * y >= m->height && 3 * y < 2 * m->height;
+        double most = 0;
+        for (int c = 0; c < (m->n_channels < 3 ? 1 : 3); c++)
+            most = fmax(most, (double)p[c]);
+        const bool is_clipped = clip >= 0 ? p[clip] > .5f : knows_full && most >= full_white;
+        n_clipped += is_clipped;
+        n_middle += is_middle, n_middle_clipped += is_middle && is_clipped;
+        if (is_middle && most > 0)
+            brightest[step_of(most)]++;
         if (!(l > 0))
             continue;
-        const double at = 128 * (log2(l) + 16);
-        histogram[at < 0 ? 0 : at >= HISTOGRAM ? HISTOGRAM - 1 : (int)at]++;
+        histogram[step_of(l)]++;
         n_lit++;
     }
     for (int i = 0; i < HISTOGRAM; i++) {
@@ -114,8 +129,15 @@ int contact_measure(struct contact_figures *out, const struct image *m, bool ful
             out->p99 = value;
         seen += histogram[i];
     }
-    free(histogram);
     out->clipped_share = (double)n_clipped / (double)n;
+    out->middle_clipped_share = n_middle ? (double)n_middle_clipped / (double)n_middle : 0;
+    if (knows_full && n_middle) {
+        int at = HISTOGRAM - 1;
+        for (size_t above = brightest[at]; at > 0 && (double)above <= glints * (double)n_middle; above += brightest[--at])
+            ;
+        out->headroom_ev = out->middle_clipped_share > glints ? 0 : fmax(0, log2(full_white) - ((at + .5) / 128 - 16));
+    }
+    free(histogram);
     return measure_sharpness(&out->sharpness, m);
 }
 
@@ -144,11 +166,26 @@ void contact_judge(struct contact_entry *e, int n, bool developed)
         const struct contact_figures *f = &e[i].figures;
         e[i].relative_sharpness = n_sharp >= 3 && usual_sharpness > 0 ? f->sharpness / usual_sharpness : NAN;
         e[i].relative_ev = n_light >= 3 && usual_light > 0 && f->p99 > 0 ? log2(f->p99 / usual_light) : NAN;
-        e[i].doubts = (e[i].relative_sharpness < soft_below ? CONTACT_SOFT : 0) | (f->clipped_share > clipped_above ? CONTACT_CLIPPED : 0) |
+        e[i].doubts = (e[i].relative_sharpness < soft_below ? CONTACT_SOFT : 0) | (f->middle_clipped_share > glints ? CONTACT_CLIPPED : 0) |
                       (e[i].relative_ev < dark_below_ev || (!developed && f->p99 < dark_p99) ? CONTACT_DARK : 0);
     }
     free(sharpness);
     free(light);
+}
+
+double contact_headroom(const struct contact_entry *e, int n)
+{
+    double *v = calloc((size_t)n + 1, sizeof(*v));
+    int n_known = 0;
+    if (!v)
+        abort();
+    for (int i = 0; i < n; i++)
+        if (!isnan(e[i].figures.headroom_ev))
+            v[n_known++] = e[i].figures.headroom_ev;
+    qsort(v, (size_t)n_known, sizeof(*v), compare_doubles);
+    const double headroom = n_known ? v[n_known / EXCEPT_ONE_OF] : NAN;
+    free(v);
+    return headroom;
 }
 
 static void tell(const struct contact_entry *e, char *out, size_t room)
@@ -158,7 +195,7 @@ static void tell(const struct contact_entry *e, char *out, size_t room)
     if (e->doubts & CONTACT_SOFT)
         used += (size_t)snprintf(out + used, room - used, " soft (%.2f of the others)", e->relative_sharpness);
     if ((e->doubts & CONTACT_CLIPPED) && used < room)
-        used += (size_t)snprintf(out + used, room - used, " clipped (%.1f %%)", 100 * e->figures.clipped_share);
+        used += (size_t)snprintf(out + used, room - used, " clipped (%.1f %%)", 100 * e->figures.middle_clipped_share);
     if ((e->doubts & CONTACT_DARK) && used < room && isnan(e->relative_ev))
         snprintf(out + used, room - used, " dark");
     else if ((e->doubts & CONTACT_DARK) && used < room)

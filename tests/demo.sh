@@ -4,6 +4,7 @@
 # BIN is where the programs lie, BOARDSIM the trigger board's simulation (is it not there, rigsim's wires are the trigger). OUT is replaced.
 # RIG: how many cameras (12; 0: no rig, pictures go straight to the solver). RIG_SCENE: a folder with linear/, geometry/ (cameras of COLMAP as
 # text), panorama.exr, start.json, and perhaps relit/ and truth/: what the cameras see instead of a synthetic studio (all views, or RIG of them).
+# Its unseen.txt, if any, names the views to set aside. RIG_TEXTURE: texels across (128).
 set -eu
 out=${1:?usage: demo.sh OUT} bin=${BIN:-build/bin} scene=${RIG_SCENE:-}
 boardsim=${BOARDSIM:-${bin%/bin}/tests/board/boardsim}
@@ -52,9 +53,9 @@ elif [ "$n_cameras" -gt 0 ]; then
     studio=$out/studio
     step "studio: $n_cameras views of one Disney material in a room lit by thousands of small lights, with a known answer (data set D3)"
     # A panorama whose texels are as large as what the fisheye resolves: smaller ones could not be photographed in their place.
-    size=720x480 panorama_px=512 true_lights=4096 # each at least 8 pixels of the panorama
-    [ "$n_cameras" -le 24 ] || size=480x320 panorama_px=256
-    "$rigsolve" synth D3 -o "$studio" --size $size --views "$n_cameras" --true-lights $true_lights --panorama-width $panorama_px --seed 1 --samples 1
+    size=720x480
+    [ "$n_cameras" -le 24 ] || size=480x320
+    "$rigsolve" synth D3 -o "$studio" --size $size --views "$n_cameras" --true-lights 4096 --panorama-width 512 --seed 1 --samples 1
 else
     studio=$out/take
     step "studio: 85 views of one Disney material in a room lit by 16,384 small lights, with a known answer (data set D3)"
@@ -81,7 +82,13 @@ place_cameras() {
         points { points = 0; if (keep) print ""; next }
         { view = $10; sub(/^.*\//, "", view); sub(/\.[^.]*$/, "", view); keep = view in name; points = 1; $10 = name[view] ".exr"; if (keep) print }' \
         "$out/cameras.txt" "$studio/geometry/cameras/images.txt" >"$out/fixed/cameras/images.txt"
-    size_px=$(awk '!/^#/ && NF { print $3 "x" $4; exit }' "$studio/geometry/cameras/cameras.txt")
+    # Of other people's pictures sensors are twice as fine: a photosite has one colour, and real ones are finer than what is asked of them.
+    finer=1
+    [ -z "$scene" ] || finer=2
+    size_px=$(awk -v k=$finer '!/^#/ && NF { print k * $3 "x" k * $4; exit }' "$studio/geometry/cameras/cameras.txt")
+    if [ -f "$studio/unseen.txt" ]; then
+        awk 'FNR == NR { name[$1 ".exr"] = $2; next } $1 in name { print name[$1] ".exr" }' "$out/cameras.txt" "$studio/unseen.txt" >"$out/unseen.txt"
+    fi
 }
 
 write_config() { # simulated|usb
@@ -98,7 +105,7 @@ free_space_mb = 200
 imageformat = raw
 iso = 100
 aperture = 8
-shutter = 1/60
+shutter = $shutter
 [develop]
 after = on
 [reconstruct]
@@ -108,8 +115,8 @@ preview = on
 then = standard
 options = $solve_options
 E
-    # The studio's panels are far brighter than white: a filter of 4 stops in front of the fisheye, as in a real studio.
-    $simulate --list | awk -v kind="$1" -v n=$((n_cameras + 1)) '
+    # The studio's panels are far brighter than white: a filter in front of the fisheye, as in a real studio.
+    $simulate --list | awk -v kind="$1" -v nd=$nd_ev -v longest=$longest -v n=$((n_cameras + 1)) '
         BEGIN { registers = int((n + 7) / 8) }
         /^\[/ { section = $1 }
         section == "[trigger]" && kind == "usb" { if (/^\[/) print "[trigger]\nkind = usb\noutput_registers = " 3 * registers "\nhalf_press_ms = 500\nhold_ms = 150\nmax_hold_ms = 3000"; next }
@@ -117,7 +124,7 @@ E
         section == "[camera" && kind == "usb" && /^relay_line/ { $3 += 16 * registers }
         section == "[panorama]" && /^head/ && kind == "usb" { $3 = "manual" }
         { print }
-        /^\[panorama\]/ { print "neutral_density_ev = 4\nstops = 0,0; 180,0\nmeter = 1/60\nlongest = 1/4\nsettle_ms = 200" }'
+        /^\[panorama\]/ { print "neutral_density_ev = " nd "\nstops = 0,-20; 120,-20; 240,-20; 0,90\nmeter = 1/60\nlongest = " longest "\nsettle_ms = 200" }'
 }
 
 start_rigd() { # config, then the words before rigd
@@ -156,12 +163,32 @@ pressed() { # a take that was not there before has all its frames
 newest() { ls -d "$out"/takes/*_"$1" | tail -n 1; }
 state_of() { grep -o '"state": *"[a-z]*"' "$1/take.json" | head -n 1 | cut -d'"' -f4; }
 
+# As in any studio: test shots, a stop less each, until only glints and lamps in view are at white.
+choose_shutter() {
+    for shutter in 1/60 1/125 1/250 1/500 1/1000; do
+        sed "s|^shutter = .*|shutter = $shutter|; s/^after = on/after = off/" "$out/rigd.conf" >"$out/rigd-test.conf"
+        start_rigd "$out/rigd-test.conf" || fail "the cameras did not come up: see $out/rigd.log and $out/rigsim.log"
+        rigctl capture --name test >/dev/null || fail "no test shot: see $out/rigd.log"
+        stop_rigd
+        "$bin/rigd-contact" "$(newest test)" -o "$out/test.png" >/dev/null
+        headroom=$(number "$out/test.json" headroom_ev)
+        printf 'a test shot at %s s: %.2f EV to white in four of five cameras, where the subject is\n' "$shutter" "$headroom"
+        ! awk -v ev="$headroom" 'BEGIN { exit ev < .25 }' || break
+    done
+    sed -i "s|^shutter = .*|shutter = $shutter|" "$out/rigd.conf" "$out/rigd-board.conf"
+}
+
 use_rig() {
     place_cameras
     address=127.$((1 + ($$ >> 16 & 127))).$(($$ >> 8 & 255)).$(($$ & 255)) # nobody else's on this machine (tests/loopback.h)
-    simulate="$bin/rigsim --cameras $((n_cameras + 1)) --personality nikon --address $address --seed 1 --raw-size $size_px --scene $out/scene --panorama $studio/panorama.exr --panorama-gain 0.0625 --trigger-socket $wires/wires"
-    solve_options="--texture $texture --hold-out every:6"
+    nd_ev=4 longest=1/4 panorama_gain=0.0625
+    [ -z "$scene" ] || nd_ev=6 longest=1 panorama_gain=0.015625 # photographed studios have lamps hundreds of times as bright as white
+    simulate="$bin/rigsim --cameras $((n_cameras + 1)) --personality nikon --address $address --seed 1 --raw-size $size_px --scene $out/scene --panorama $studio/panorama.exr --panorama-gain $panorama_gain --panorama-raw-size 1440x960 --trigger-socket $wires/wires"
+    hold_out=every:6
+    [ ! -s "$out/unseen.txt" ] || hold_out=list:$out/unseen.txt
+    solve_options="--texture $texture --hold-out $hold_out"
     export RIGD_SOCKET="$wires/rigd"
+    shutter=1/60
     write_config simulated >"$out/rigd.conf"
     write_config usb >"$out/rigd-board.conf"
 
@@ -169,10 +196,11 @@ use_rig() {
     $simulate >"$out/rigsim.log" 2>&1 &
     sim=$!
     while [ ! -S "$wires/wires" ]; do kill -0 "$sim" 2>/dev/null || fail "the cameras did not start: see $out/rigsim.log"; sleep .1; done
+    [ -z "$scene" ] || choose_shutter
     start_rigd "$out/rigd.conf" || fail "the cameras did not come up: see $out/rigd.log and $out/rigsim.log"
     echo "$((n_cameras + 1)) of $((n_cameras + 1)) cameras are ready"
 
-    step "panorama: a fisheye on a head sees the studio's lights in two stops; each is bracketed until no light clips, then merged"
+    step "panorama: a fisheye on a head sees the studio's lights in four stops; each is bracketed until no light clips, then merged"
     rigctl panorama --name lights || fail "no panorama: see $out/rigd.log"
     rigctl process "$(basename "$(newest lights)")" --watch || [ $? -eq 3 ] || fail "the panorama was not merged: see $(newest lights)/log"
 
@@ -230,35 +258,40 @@ no_rig() {
     "$rigsolve" solve "$studio" -o "$solve" --texture 256 || [ $? -eq 3 ] || fail "the solve failed"
 }
 
-texture=128
+texture=${RIG_TEXTURE:-128}
 if [ "$n_cameras" -gt 0 ]; then use_rig; else no_rig; fi
 
 # ---- how good is it -----------------------------------------------------------------------------------------------------------
 step "judged: the solved material as the cameras see it that were set aside, beside their pictures; then under lights that the solve has never seen"
 mkdir "$out/aside" # cameras of views that the solver did not fit
 cp "$cameras"/cameras.txt "$cameras"/points3D.txt "$out/aside/"
-tr -d ' \n"' <"$solve/report.json" | sed -n 's/.*views_held_out:\[\([^]]*\)\].*/\1/p' | tr ',' '\n' | sed 's/\.exr$//' >"$out/views-aside"
+tr -d ' \n"' <"$solve/report.json" | sed -n 's/.*views_held_out:\[\([^]]*\)\].*/\1/p' | tr ',' '\n' | sed 's/\.exr$//' >"$out/views-all-aside"
+awk '{ v[NR] = $0 } END { n = NR < 6 ? NR : 6; for (i = 0; i < n; i++) print v[int(i * NR / n) + 1] }' "$out/views-all-aside" >"$out/views-aside" # six are pictures enough
 awk 'FNR == NR { is_aside[$1] = 1; next } /^#/ { next } points { points = 0; if (keep) print ""; next }
     { view = $10; sub(/\.[^.]*$/, "", view); keep = view in is_aside; points = 1; if (keep) print }' "$out/views-aside" "$cameras/images.txt" >"$out/aside/images.txt"
 # To be compared is where the object is: pixels that get any light of a few lamps.
-mask() { # cameras, panorama, JSON with its pose, folder to make
-    "$rigsolve" render "$solve" --cameras "$1" --panorama "$2" --world-from-probe "$3" -n 32 --no-shadows --samples 1 --exposure 20 -o "$4" >/dev/null
+mask() { # cameras, panorama, JSON with its pose, folder to make, option
+    # shellcheck disable=SC2086
+    "$rigsolve" render "$solve" --cameras "$1" --panorama "$2" --world-from-probe "$3" -n 32 --no-shadows --samples 1 --exposure 20 -o "$4" $5 >/dev/null
     rm -f "$4"/*.exr
 }
-"$rigsolve" render "$solve" --cameras "$out/aside" -o "$out/views" --no-shadows
-mask "$out/aside" "$panorama" "$solve/report.json" "$out/masks"
+as_taken=
+[ -z "${size_px-}" ] || as_taken="--size $size_px"
+# shellcheck disable=SC2086
+"$rigsolve" render "$solve" --cameras "$out/aside" -o "$out/views" --no-shadows $as_taken
+mask "$out/aside" "$panorama" "$solve/report.json" "$out/masks" "$as_taken"
 "$rigsolve" compare --mask "$out/masks" "$out/views" "$images" >"$out/compare.txt" 2>"$out/compare.log"
 figure() { sed -n '$s/.*RMSE  *\([0-9.]* %\)  *PSNR  *\([0-9.]* dB\).*/\1 (\2)/p' "$1"; }
 {
     printf 'views set aside, where texels are      RMSE %.3f %%   (fitted views %.3f %%)\n' "$(number "$solve/report.json" rmse_held_out_percent)" "$(number "$solve/report.json" rmse_fit_percent)"
-    printf 'the same, whole object with its edges  RMSE %s\n' "$(figure "$out/compare.txt")"
+    printf '%s of them, whole object with its edges RMSE %s\n' "$(wc -l <"$out/views-aside")" "$(figure "$out/compare.txt")"
 } >"$out/figures.txt"
 if [ -f "$studio/relit/probe.json" ]; then
     panels=$studio/relit/panels.json
     [ -f "$panels" ] || panels=$studio/relit/lights.json
     "$rigsolve" render "$solve" --cameras "$studio/relit/cameras" --panorama "$studio/relit/panorama.exr" --world-from-probe "$studio/relit/probe.json" --panels "$panels" -n 512 \
         -o "$out/relit" >/dev/null 2>&1
-    mask "$studio/relit/cameras" "$studio/relit/panorama.exr" "$studio/relit/probe.json" "$out/masks-relit"
+    mask "$studio/relit/cameras" "$studio/relit/panorama.exr" "$studio/relit/probe.json" "$out/masks-relit" ''
     "$rigsolve" compare --mask "$out/masks-relit" "$out/relit" "$studio/relit/linear" >"$out/relit.txt"
     printf 'under other lights (512 of them)       RMSE %s\n' "$(figure "$out/relit.txt")" >>"$out/figures.txt"
 fi

@@ -522,6 +522,26 @@ static void doubt_of_the_light_is_what_moving_it_changes(void **state)
     assert_true(n_looked_at > 200);
 }
 
+// At infinity the centre's place says nothing, so that its deviation is infinite - and no texel's light depends on it.
+static void lights_at_infinity_are_not_doubted_for_their_centre(void **state)
+{
+    (void)state;
+    const struct materials_settings set = materials_defaults();
+    struct lights far = d3.truth.lights;
+    struct materials_input in = input_of(&d3);
+    struct estimate e;
+    float *std = calloc((size_t)far.n, sizeof(*std));
+    far.inverse_distance = calloc((size_t)far.n, sizeof(*far.inverse_distance));
+    in.lights = &far, in.visible = NULL;
+    in.centre_std_m[0] = in.centre_std_m[1] = in.centre_std_m[2] = INFINITY;
+    assert_int_equal(estimate_new(&e, &in, &set), 0);
+    const struct judging j = { .e = &e, .in = &in, .inverse_distance_std = std };
+    for (int t = 0; t < d3.texels.n; t += 7)
+        assert_true(light_doubt(&j, t) == 0);
+    free(std), free(far.inverse_distance);
+    estimate_free(&e);
+}
+
 static void what_is_not_known_of_the_lights_is_not_known_of_the_albedo(void **state)
 {
     (void)state;
@@ -719,6 +739,7 @@ int main(void)
         cmocka_unit_test(a_glaze_under_lights_that_are_off_is_no_half_metal),
         cmocka_unit_test(what_is_said_to_be_known_is),
         cmocka_unit_test(doubt_of_the_light_is_what_moving_it_changes),
+        cmocka_unit_test(lights_at_infinity_are_not_doubted_for_their_centre),
         cmocka_unit_test(what_is_not_known_of_the_lights_is_not_known_of_the_albedo),
         cmocka_unit_test(four_materials_are_told_apart),
         cmocka_unit_test(selection_beats_the_plain_fit_on_views_not_fitted),

@@ -2,6 +2,7 @@
 #include "tests/rigsim/probe.h"
 #include "solver/panorama.h"
 #include "solver/take/log.h"
+#include "tests/rigsim/frame.h"
 #include "tests/scratch.h"
 
 #include <math.h>
@@ -146,6 +147,43 @@ static void lamps_flicker(void **state)
     probe_close(p);
 }
 
+static const char *any_name(unsigned camera)
+{
+    return camera ? "B" : "A";
+}
+
+static void a_panorama_camera_has_a_sensor_of_its_own_size(void **state)
+{
+    (void)state;
+    static const float lamp[3] = { 100, 100, 100 };
+    static struct personality personality;
+    enum { W = 64, H = 48 };
+    struct scene *scene;
+    struct probe *p;
+    uint64_t bytes[2];
+    write_panorama("p.exr", 100, 60, lamp);
+    assert_int_equal(personality_load(&personality, "nikon"), 0);
+    assert_int_equal(scene_open(&scene, NULL, W, H, 2, any_name), 0);
+    assert_int_equal(probe_open(&p, scratch_path("p.exr"), lenses[0], 1, SENSOR_W, SENSOR_H), 0);
+    scene_give(scene, 1, p);
+    for (unsigned i = 0; i < 2; i++) {
+        const struct exposure e = { .shot = 1, .time_s = personality.t_ref_s, .f_number = personality.n_ref, .iso = 100, .view = { 0, 0, 1 } };
+        const uint64_t sites = i ? SENSOR_W * SENSOR_H : W * H;
+        struct body b;
+        struct frame *f;
+        uint8_t row[SENSOR_W * 2];
+        assert_int_equal(body_init(&b, &personality, i, 1, 0, 0), 0);
+        assert_int_equal(frame_open(&f, scene, &b, &e, FILES_RAW), 0);
+        bytes[i] = frame_size(f);
+        assert_true(bytes[i] > 2 * sites && bytes[i] < 2 * sites + 20000);
+        for (uint64_t at = 0; at < bytes[i]; at += sizeof(row))
+            frame_read(f, at, row, bytes[i] - at < sizeof(row) ? (size_t)(bytes[i] - at) : sizeof(row));
+        frame_close(f);
+        body_free(&b);
+    }
+    scene_close(scene);
+}
+
 int main(void)
 {
     log_set_level(LOG_WARNING);
@@ -154,6 +192,7 @@ int main(void)
         cmocka_unit_test(the_head_turns_left_and_up),
         cmocka_unit_test(rows_do_not_depend_on_the_order_in_which_they_are_read),
         cmocka_unit_test(lamps_flicker),
+        cmocka_unit_test(a_panorama_camera_has_a_sensor_of_its_own_size),
     };
     if (scratch_open())
         return 1;

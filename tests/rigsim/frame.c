@@ -51,7 +51,7 @@ static void make_normals(void)
 
 static void make_row(struct frame *f, int y)
 {
-    const int width = scene_width(f->scene);
+    const int width = scene_width(f->scene, f->camera);
     const float k[2] = { f->electrons[y & 1], f->electrons[1 + (y & 1)] };
     const uint64_t row_seed = random_u64(f->noise_seed, STREAM_NOISE, (uint64_t)y);
     scene_row(f->scene, f->camera, &f->view, y, f->site);
@@ -72,7 +72,7 @@ static void make_row(struct frame *f, int y)
 static struct raw_dng_info describe(const struct scene *scene, const struct body *b, const struct exposure *e)
 {
     const struct personality *p = b->personality;
-    struct raw_dng_info i = { .width_px = scene_width(scene), .height_px = scene_height(scene),
+    struct raw_dng_info i = { .width_px = scene_width(scene, b->index), .height_px = scene_height(scene, b->index),
                               .black_level = p->black_level, .white_level = p->white_level, .make = p->manufacturer,
                               .model = p->model, .lens = p->lens, .serial = b->serial, .firmware = p->firmware,
                               .time_s = e->time_s, .f_number = e->f_number, .focal_mm = FOCAL_MM, .iso = e->iso,
@@ -102,7 +102,7 @@ static uint8_t srgb8(double v)
 // The frame at a fraction of its size: one cell of four sites per pixel.
 static int develop(struct dataset *out, struct scene *scene, const struct body *b, const struct exposure *e, int width)
 {
-    const int sensor_width = scene_width(scene), sensor_height = scene_height(scene);
+    const int sensor_width = scene_width(scene, b->index), sensor_height = scene_height(scene, b->index);
     if (width > sensor_width / 2)
         width = sensor_width / 2;
     const int height = (int)((int64_t)width * sensor_height / sensor_width) > 0 ? (int)((int64_t)width * sensor_height / sensor_width) : 1;
@@ -147,8 +147,8 @@ int frame_open(struct frame **out, struct scene *scene, const struct body *b, co
         err = develop(&f->jpeg, scene, b, e, JPEG_WIDTH);
     } else {
         const struct raw_dng_info info = describe(scene, b, e);
-        f->site = malloc((size_t)scene_width(scene) * sizeof(float));
-        f->row = malloc((size_t)scene_width(scene) * sizeof(uint16_t));
+        f->site = malloc((size_t)scene_width(scene, b->index) * sizeof(float));
+        f->row = malloc((size_t)scene_width(scene, b->index) * sizeof(uint16_t));
         err = f->site && f->row ? raw_dng_make(&f->dng, &info) : -ENOMEM;
     }
     if (err) {
@@ -170,7 +170,7 @@ void frame_read(struct frame *f, uint64_t offset, uint8_t *to, size_t n)
         memcpy(to, f->jpeg.data + offset, n);
         return;
     }
-    const uint64_t row_bytes = (uint64_t)scene_width(f->scene) * 2, pixels_at = f->dng.n_head,
+    const uint64_t row_bytes = (uint64_t)scene_width(f->scene, f->camera) * 2, pixels_at = f->dng.n_head,
                    tail_at = pixels_at + f->dng.n_pixel_bytes;
     while (n) {
         size_t part;

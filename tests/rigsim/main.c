@@ -22,7 +22,7 @@ static const char doc[] =
     "tests/rigsim/README.md says what is simulated, and how to script faults.";
 
 enum { OPTION_RAW_SIZE = 256, OPTION_SEED, OPTION_FAULTS, OPTION_LIST, OPTION_TRIGGER, OPTION_CLOCK, OPTION_SET, OPTION_PERSONALITY,
-       OPTION_SCENE, OPTION_PANORAMA, OPTION_PANORAMA_CAMERA, OPTION_PANORAMA_GAIN, OPTION_LENS, OPTION_ADDRESS };
+       OPTION_SCENE, OPTION_PANORAMA, OPTION_PANORAMA_CAMERA, OPTION_PANORAMA_GAIN, OPTION_PANORAMA_RAW_SIZE, OPTION_LENS, OPTION_ADDRESS };
 static const struct argp_option options[] = {
     { "cameras", 'n', "N", 0, "how many, 1 .. 500 (default 1)", 0 },
     { "address", OPTION_ADDRESS, "A", 0, "of this machine only: 127.x.y.z (default 127.0.0.1); rigs with an address each cannot get in each other's way", 0 },
@@ -33,6 +33,7 @@ static const struct argp_option options[] = {
     { "panorama", OPTION_PANORAMA, "FILE", 0, "latitude-longitude .hdr or .exr: one camera on a motorised head sees this through its lens", 0 },
     { "panorama-camera", OPTION_PANORAMA_CAMERA, "I", 0, "which camera that is, from 0 (default: the last)", 0 },
     { "panorama-gain", OPTION_PANORAMA_GAIN, "X", 0, "scene values per radiance of FILE (default 1); 2^-EV for a neutral-density filter", 0 },
+    { "panorama-raw-size", OPTION_PANORAMA_RAW_SIZE, "WxH", 0, "of that camera's raws (default: as --raw-size)", 0 },
     { "lens", OPTION_LENS, "JSON|FILE", 0, "of that camera (rigd/lens.h; default an equisolid fisheye of 180 degrees across the frame's height)", 0 },
     { "raw-size", OPTION_RAW_SIZE, "WxH", 0, "of the raws, even numbers (default 2448x1632: 8 MB)", 0 },
     { "seed", OPTION_SEED, "S", 0, "of lags and noise (default 0)", 0 },
@@ -60,6 +61,21 @@ static long number(struct argp_state *state, const char *what, const char *text,
     if (!*text || *end || errno || v < min || v > max)
         argp_error(state, "%s: found '%s'; expected a whole number %ld .. %ld", what, text, min, max);
     return v;
+}
+
+// WxH, even.
+static void size(struct argp_state *state, const char *name, char *text, int *width, int *height)
+{
+    char what[64], *x = strchr(text, 'x');
+    if (!x)
+        argp_error(state, "%s: found '%s'; expected WxH such as 2448x1632", name, text);
+    *x = 0;
+    snprintf(what, sizeof(what), "%s's width", name);
+    *width = (int)number(state, what, text, 16, 20000);
+    snprintf(what, sizeof(what), "%s's height", name);
+    *height = (int)number(state, what, x + 1, 16, 20000);
+    if (*width % 2 || *height % 2)
+        argp_error(state, "%s: found %dx%d; expected even numbers (RGGB cells)", name, *width, *height);
 }
 
 static error_t option(int key, char *text, struct argp_state *state)
@@ -106,14 +122,10 @@ static error_t option(int key, char *text, struct argp_state *state)
         a->server.lens = text;
         return 0;
     case OPTION_RAW_SIZE:
-        x = strchr(text, 'x');
-        if (!x)
-            argp_error(state, "--raw-size: found '%s'; expected WxH such as 2448x1632", text);
-        *x = 0;
-        a->server.width_px = (int)number(state, "--raw-size's width", text, 16, 20000);
-        a->server.height_px = (int)number(state, "--raw-size's height", x + 1, 16, 20000);
-        if (a->server.width_px % 2 || a->server.height_px % 2)
-            argp_error(state, "--raw-size: found %dx%d; expected even numbers (RGGB cells)", a->server.width_px, a->server.height_px);
+        size(state, "--raw-size", text, &a->server.width_px, &a->server.height_px);
+        return 0;
+    case OPTION_PANORAMA_RAW_SIZE:
+        size(state, "--panorama-raw-size", text, &a->server.panorama_width_px, &a->server.panorama_height_px);
         return 0;
     case OPTION_SEED: {
         errno = 0;
@@ -145,8 +157,10 @@ static error_t option(int key, char *text, struct argp_state *state)
         a->server.panorama_camera = a->panorama_camera < 0 ? a->server.n_cameras - 1 : (unsigned)a->panorama_camera;
         if (a->server.panorama_camera >= a->server.n_cameras)
             argp_error(state, "--panorama-camera %d: there are %u cameras, from 0", a->panorama_camera, a->server.n_cameras);
-        if (!a->server.panorama && (a->server.lens || a->panorama_camera >= 0))
-            argp_error(state, "--lens and --panorama-camera need --panorama FILE");
+        if (!a->server.panorama && (a->server.lens || a->panorama_camera >= 0 || a->server.panorama_width_px))
+            argp_error(state, "--lens, --panorama-camera and --panorama-raw-size need --panorama FILE");
+        if (!a->server.panorama_width_px)
+            a->server.panorama_width_px = a->server.width_px, a->server.panorama_height_px = a->server.height_px;
         return 0;
     default:
         return ARGP_ERR_UNKNOWN;
@@ -157,7 +171,7 @@ static error_t option(int key, char *text, struct argp_state *state)
 static void print_panorama(const struct server_settings *s)
 {
     struct lens l;
-    if (probe_lens(&l, s->lens, s->width_px, s->height_px))
+    if (probe_lens(&l, s->lens, s->panorama_width_px, s->panorama_height_px))
         return;
     printf("[panorama]\ncamera = %s\nhead = %s\nlens = %s\nwidth_px = %d\nheight_px = %d\nfocal_px = %.6f\ncentre_px = %.6f, %.6f\n", server_camera_name(s->panorama_camera),
            s->trigger_socket ? "board" : "manual", lens_model_name(l.model), l.width_px, l.height_px, l.focal_px, l.centre_px[0], l.centre_px[1]);
@@ -208,7 +222,7 @@ int main(int argc, char **argv)
     char fisheye[160];
     if (!a.server.lens) { // 2 f sin(45 degrees) is the image circle's radius
         snprintf(fisheye, sizeof(fisheye), "{\"model\":\"equisolid\",\"focal_px\":%.3f,\"circle_px\":%.1f,\"max_angle_deg\":90}",
-                 .5 * a.server.height_px / M_SQRT2, .5 * a.server.height_px);
+                 .5 * a.server.panorama_height_px / M_SQRT2, .5 * a.server.panorama_height_px);
         a.server.lens = fisheye;
     }
     a.server.personality = p;

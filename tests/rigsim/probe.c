@@ -262,6 +262,16 @@ fail:
     return err;
 }
 
+int probe_width(const struct probe *p)
+{
+    return p->lens.width_px;
+}
+
+int probe_height(const struct probe *p)
+{
+    return p->lens.height_px;
+}
+
 void probe_close(struct probe *p)
 {
     if (!p)

@@ -14,5 +14,7 @@ struct probe;
 int probe_open(struct probe **out, const char *panorama, const char *lens, double gain, int width_px, int height_px);
 int probe_lens(struct lens *out, const char *lens, int width_px, int height_px); // the lens alone
 void probe_close(struct probe *p); // NULL allowed
+int probe_width(const struct probe *p);
+int probe_height(const struct probe *p);
 // As scene_row().
 void probe_row(struct probe *p, const struct scene_view *view, int y, float *site);

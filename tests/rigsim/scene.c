@@ -231,12 +231,12 @@ void scene_row(struct scene *s, unsigned camera, const struct scene_view *view, 
         site[x] = float_from_half(plane[(size_t)y * width + x]);
 }
 
-int scene_width(const struct scene *s)
+int scene_width(const struct scene *s, unsigned camera)
 {
-    return s->width;
+    return s->probe && camera == s->probe_camera ? probe_width(s->probe) : s->width;
 }
 
-int scene_height(const struct scene *s)
+int scene_height(const struct scene *s, unsigned camera)
 {
-    return s->height;
+    return s->probe && camera == s->probe_camera ? probe_height(s->probe) : s->height;
 }

@@ -18,9 +18,9 @@ struct scene_view {            // of an exposure
 int scene_open(struct scene **out, const char *folder, int width_px, int height_px, unsigned n_cameras,
                const char *(*camera_name)(unsigned camera));
 void scene_close(struct scene *s); // NULL allowed
-void scene_give(struct scene *s, unsigned camera, struct probe *probe); // what this camera sees; takes probe
+void scene_give(struct scene *s, unsigned camera, struct probe *probe); // what this camera sees, in its own size; takes probe
 // Radiance at every site of row y (even rows R G R G ..., odd rows G B G B ...), 1 = diffuse white; site[width]. A picture that
 // cannot be read is logged once and is black.
 void scene_row(struct scene *s, unsigned camera, const struct scene_view *view, int y, float *site);
-int scene_width(const struct scene *s);
-int scene_height(const struct scene *s);
+int scene_width(const struct scene *s, unsigned camera);
+int scene_height(const struct scene *s, unsigned camera);

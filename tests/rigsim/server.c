@@ -478,8 +478,8 @@ static int open_cameras(struct server *s)
         ptp_session_init(&c->session, &c->body);
         c->session.thumbnail = frame_thumbnail;
         c->session.arg = s->scene;
-        c->session.width_px = (uint32_t)t->width_px;
-        c->session.height_px = (uint32_t)t->height_px;
+        c->session.width_px = (uint32_t)scene_width(s->scene, i);
+        c->session.height_px = (uint32_t)scene_height(s->scene, i);
         c->fault_count = calloc(t->faults && t->faults->n ? (size_t)t->faults->n : 1, sizeof(c->fault_count[0]));
         if (!c->fault_count)
             return -ENOMEM;
@@ -529,7 +529,7 @@ static int open_server(struct server *s)
     err = err ? err : scene_open(&s->scene, t->scene, t->width_px, t->height_px, t->n_cameras, server_camera_name);
     if (!err && t->panorama) {
         struct probe *probe;
-        err = probe_open(&probe, t->panorama, t->lens, t->panorama_gain, t->width_px, t->height_px);
+        err = probe_open(&probe, t->panorama, t->lens, t->panorama_gain, t->panorama_width_px, t->panorama_height_px);
         if (!err)
             scene_give(s->scene, t->panorama_camera, probe);
     }

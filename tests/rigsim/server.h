@@ -17,6 +17,7 @@ struct server_settings {
     uint64_t seed;
     const char *panorama, *lens; // of the panorama camera (probe.h); NULL: none
     unsigned panorama_camera;
+    int panorama_width_px, panorama_height_px; // of its raws
     double panorama_gain;
     const char *trigger_socket; // shutter_line.h; NULL: none
     bool fixed_clock;

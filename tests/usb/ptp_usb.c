@@ -41,8 +41,8 @@ int ptp_usb_open(struct ptp_usb *p, const struct personality *personality, struc
     ptp_session_init(&p->session, &p->body);
     p->session.thumbnail = frame_thumbnail;
     p->session.arg = scene;
-    p->session.width_px = (uint32_t)scene_width(scene);
-    p->session.height_px = (uint32_t)scene_height(scene);
+    p->session.width_px = (uint32_t)scene_width(scene, p->body.index);
+    p->session.height_px = (uint32_t)scene_height(scene, p->body.index);
     return 0;
 }
 
