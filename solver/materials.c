@@ -619,7 +619,8 @@ static double light_doubt(const struct judging *j, int texel)
         of_distances += (double)(here * fabsf(along) * j->inverse_distance_std[i]);
     }
     for (int c = 0; c < 3; c++)
-        variance += of_centre[c] * of_centre[c] * j->in->centre_std_m[c] * j->in->centre_std_m[c];
+        if (of_centre[c] != 0) // lights at infinity leave the centre open, and nothing depends on it
+            variance += of_centre[c] * of_centre[c] * j->in->centre_std_m[c] * j->in->centre_std_m[c];
     return E > 0 ? sqrt(variance + of_distances * of_distances) / E : 0;
 }
 

@@ -86,7 +86,7 @@ static const char doc[] =
     "15 CPU minutes. Around one base setting one thing at a time is changed; the presets stand beside. Each solve is a process of its "
     "own and becomes one row of chart.csv: settings, CPU and wall seconds, peak memory, and three errors, RMSE in percent of white: "
     "of samples fitted, of samples of views held out (both at texel centres), and of pictures: up to three held-out views rendered again and compared with the "
-    "photographs inside the object's outline; that one is drawn over CPU seconds. A solve that fails is a row, too; take the row out of chart.csv to have it solved again. "
+    "photographs inside the object's outline. The last two are drawn over CPU seconds. A solve that fails is a row, too; take the row out of chart.csv to have it solved again. "
     "A chart that was interrupted goes on where it was. "
     "The pictures are drawn by gnuplot; without it there are chart.csv and chart.gp, and a warning.\n\n"
     "Exit status: 0 done, with solves that failed or are not to be trusted marked as such; 1 failed, 2 usage.";
@@ -299,19 +299,21 @@ static int run_self(int *status, struct rusage *use, const char *const *argv, co
     return 0;
 }
 
-// The last line that a program wrote, without what CSV cannot hold.
-static void last_line(char out[CHART_REASON_MAX], const char *path)
+// What a program that failed gave as the cause: its last "error: ", else its last line.
+static void read_cause(char out[CHART_REASON_MAX], const char *path)
 {
-    char *text;
+    char *text, *save = NULL, *cause = NULL, *last = NULL;
     size_t n;
     snprintf(out, CHART_REASON_MAX, "no message");
     if (file_read(&text, &n, path, 1 << 26))
         return;
-    while (n > 0 && (text[n - 1] == '\n' || text[n - 1] == '\r'))
-        text[--n] = 0;
-    const char *line = strrchr(text, '\n') ? strrchr(text, '\n') + 1 : text;
-    if (*line)
-        snprintf(out, CHART_REASON_MAX, "%s", line);
+    for (char *line = strtok_r(text, "\r\n", &save); line; line = strtok_r(NULL, "\r\n", &save)) {
+        last = line;
+        if (strstr(line, "error: "))
+            cause = strstr(line, "error: ") + strlen("error: ");
+    }
+    if (cause || last)
+        snprintf(out, CHART_REASON_MAX, "%s", cause ? cause : last);
     free(text);
 }
 
@@ -344,7 +346,7 @@ static int make_synthetic(struct set *s, const struct arguments *a)
     log_info("chart: %s: %d views of %s pixels are made", s->name, a->n_views, size);
     int err = run_self(&status, &use, argv, NULL, log_path);
     if (!err && status != EXIT_DONE) {
-        last_line(reason, log_path);
+        read_cause(reason, log_path);
         log_error("chart: %s: cannot be made: %s", s->name, reason);
         err = -EIO;
     }
@@ -788,7 +790,7 @@ static int solve_one(struct chart_row *row, const struct set *s, const struct ar
     } else if (status >= 128) {
         snprintf(row->stop_reason, sizeof(row->stop_reason), "killed by signal %d (%s)", status - 128, strsignal(status - 128));
     } else {
-        last_line(row->stop_reason, log_path);
+        read_cause(row->stop_reason, log_path);
         plain_text(row->stop_reason);
     }
     if (row->solved)
@@ -907,14 +909,15 @@ static int print_rows(const struct table *t, bool as_json)
 {
     struct json *rows = as_json ? json_array() : NULL;
     if (!as_json)
-        printf("%-16s %-14s %10s %12s %12s %10s  (* nothing is both cheaper and better)\n", "set", "setting", "CPU s", "samples, %", "pictures, %", "peak MiB");
+        printf("%-16s %-14s %10s %13s %13s %10s  (* nothing cheaper is as good, by 1 %%)\n", "set", "setting", "CPU s", "samples, %", "pictures, %", "peak MiB");
     for (int i = 0; i < t->n; i++) {
         const struct chart_row *r = &t->row[i];
         char label[CHART_NAME_MAX];
         chart_label(label, sizeof(label), r);
         if (!as_json && r->solved)
-            printf("%-16s %-14s %10.1f %12.3f %12.3f %10.0f %s%s\n", r->set, label, r->cpu_s, r->rmse_held_out_percent, r->rmse_pictures_percent,
-                   (double)r->peak_rss_bytes / 1048576, chart_on_front(t->row, t->n, i) ? "*" : " ", r->trusted ? "" : " not to be trusted");
+            printf("%-16s %-14s %10.1f %11.3f %s %11.3f %s %10.0f%s\n", r->set, label, r->cpu_s, r->rmse_held_out_percent,
+                   chart_on_front(t->row, t->n, i, CHART_SAMPLES) ? "*" : " ", r->rmse_pictures_percent, chart_on_front(t->row, t->n, i, CHART_PICTURES) ? "*" : " ",
+                   (double)r->peak_rss_bytes / 1048576, r->trusted ? "" : "  not to be trusted");
         else if (!as_json)
             printf("%-16s %-14s failed: %s\n", r->set, label, r->stop_reason);
         if (!as_json)
@@ -937,7 +940,8 @@ static int print_rows(const struct table *t, bool as_json)
                 break;
             }
         }
-        json_set_bool(o, "on_front", chart_on_front(t->row, t->n, i));
+        json_set_bool(o, "on_front_of_pictures", chart_on_front(t->row, t->n, i, CHART_PICTURES));
+        json_set_bool(o, "on_front_of_samples", chart_on_front(t->row, t->n, i, CHART_SAMPLES));
         json_append(rows, o);
     }
     return as_json ? output_json("chart", rows) : output_flush("chart");

@@ -18,9 +18,9 @@
 extern char **environ;
 
 enum {
-    PANEL_WIDTH = 560, PANEL_HEIGHT = 500, LEFT = 72, RIGHT = 16, TOP = 44, BOTTOM = 56, HEAD = 40, FOOT = 108, // pixels
-    CHARACTER_WIDTH = 7, LINE_HEIGHT = 15, GAP = 9,
-    MAX_BOXES = 256,
+    PANEL_WIDTH = 560, PANEL_HEIGHT = 440, LEFT = 72, RIGHT = 16, TOP = 44, BOTTOM = 56, HEAD = 40, FOOT = 108, // pixels
+    CHARACTER_WIDTH = 7, LINE_HEIGHT = 15, GAP = 10,
+    MAX_BOXES = 4096, N_MEASURES = 2,
 };
 
 static const struct style {
@@ -44,23 +44,23 @@ static const struct style *style_of(const struct chart_row *r)
     return &styles[0];
 }
 
-double chart_error_percent(const struct chart_row *row)
+double chart_error_percent(const struct chart_row *row, enum chart_measure measure)
 {
-    return row->solved ? row->rmse_pictures_percent : NAN;
+    return !row->solved ? NAN : measure == CHART_PICTURES ? row->rmse_pictures_percent : row->rmse_held_out_percent;
 }
 
-static bool drawn(const struct chart_row *r)
+static bool drawn(const struct chart_row *r, enum chart_measure measure)
 {
-    return chart_error_percent(r) > 0 && r->cpu_s > 0;
+    return chart_error_percent(r, measure) > 0 && r->cpu_s > 0;
 }
 
-bool chart_on_front(const struct chart_row *rows, int n, int i)
+bool chart_on_front(const struct chart_row *rows, int n, int i, enum chart_measure measure)
 {
-    if (!drawn(&rows[i]))
+    if (!drawn(&rows[i], measure))
         return false;
     for (int k = 0; k < n; k++)
-        if (k != i && drawn(&rows[k]) && !strcmp(rows[k].set, rows[i].set) && rows[k].cpu_s < rows[i].cpu_s &&
-            chart_error_percent(&rows[k]) <= chart_error_percent(&rows[i]))
+        if (k != i && drawn(&rows[k], measure) && !strcmp(rows[k].set, rows[i].set) && rows[k].cpu_s < rows[i].cpu_s &&
+            chart_error_percent(&rows[k], measure) <= 1.01 * chart_error_percent(&rows[i], measure))
             return false;
     return true;
 }
@@ -83,11 +83,13 @@ void chart_label(char *out, int size, const struct chart_row *r)
 
 struct box {
     double x0, y0, x1, y1; // pixels of the whole picture, y upwards
+    double weight;         // how bad it is to cover it
 };
 struct panel {
     const struct chart_row *rows;
     int n;
     const char *set;
+    enum chart_measure measure;
     struct box area;
     double low[2], high[2]; // of CPU seconds and error
     struct box taken[MAX_BOXES];
@@ -102,7 +104,7 @@ static bool in_panel(const struct panel *p, int i)
 static void place_px(const struct panel *p, const struct chart_row *r, double *x, double *y)
 {
     *x = p->area.x0 + (p->area.x1 - p->area.x0) * log(r->cpu_s / p->low[0]) / log(p->high[0] / p->low[0]);
-    *y = p->area.y0 + (p->area.y1 - p->area.y0) * log(chart_error_percent(r) / p->low[1]) / log(p->high[1] / p->low[1]);
+    *y = p->area.y0 + (p->area.y1 - p->area.y0) * log(chart_error_percent(r, p->measure) / p->low[1]) / log(p->high[1] / p->low[1]);
 }
 
 // The range in which all points lie, with room for labels around them.
@@ -111,8 +113,8 @@ static void choose_ranges(struct panel *p)
     for (int k = 0; k < 2; k++)
         p->low[k] = INFINITY, p->high[k] = 0;
     for (int i = 0; i < p->n; i++)
-        if (in_panel(p, i) && drawn(&p->rows[i])) {
-            const double at[2] = { p->rows[i].cpu_s, chart_error_percent(&p->rows[i]) };
+        if (in_panel(p, i) && drawn(&p->rows[i], p->measure)) {
+            const double at[2] = { p->rows[i].cpu_s, chart_error_percent(&p->rows[i], p->measure) };
             for (int k = 0; k < 2; k++)
                 p->low[k] = fmin(p->low[k], at[k]), p->high[k] = fmax(p->high[k], at[k]);
         }
@@ -157,7 +159,7 @@ static double crowding(const struct panel *p, const struct box *b)
         sum += 1e6;
     for (int k = 0; k < p->n_taken; k++)
         if (overlap(b, &p->taken[k]))
-            sum += (fmin(b->x1, p->taken[k].x1) - fmax(b->x0, p->taken[k].x0)) * (fmin(b->y1, p->taken[k].y1) - fmax(b->y0, p->taken[k].y0));
+            sum += p->taken[k].weight * (fmin(b->x1, p->taken[k].x1) - fmax(b->x0, p->taken[k].x0)) * (fmin(b->y1, p->taken[k].y1) - fmax(b->y0, p->taken[k].y0));
     return sum;
 }
 
@@ -165,6 +167,16 @@ static void take_box(struct panel *p, struct box b)
 {
     if (p->n_taken < MAX_BOXES)
         p->taken[p->n_taken++] = b;
+}
+
+// A line of the drawing, as small boxes.
+static void take_line(struct panel *p, double x0, double y0, double x1, double y1)
+{
+    const int n = (int)ceil(hypot(x1 - x0, y1 - y0) / 5);
+    for (int i = 0; i <= n; i++) {
+        const double x = x0 + (x1 - x0) * i / fmax(n, 1), y = y0 + (y1 - y0) * i / fmax(n, 1);
+        take_box(p, (struct box){ x - 2.5, y - 2.5, x + 2.5, y + 2.5, .3 });
+    }
 }
 
 // Beside its point, where the least is in the way; further off with a thin line to the point.
@@ -175,14 +187,15 @@ static void write_label(FILE *f, struct panel *p, const struct chart_row *r, dou
     chart_label(text, sizeof(text), r);
     double x, y, best = INFINITY, best_distance = 0;
     struct box found = { 0 };
-    const double w = CHARACTER_WIDTH * (double)strlen(text), h = LINE_HEIGHT;
+    const bool large = !strcmp(r->axis, "preset");
+    const double w = (large ? 1.25 : 1) * CHARACTER_WIDTH * (double)strlen(text), h = (large ? 1.25 : 1) * LINE_HEIGHT;
     place_px(p, r, &x, &y);
-    for (int ring = 0; ring < 5 && best > 0; ring++)
+    for (int ring = 0; ring < 6 && best > 0; ring++)
         for (int k = 0; k < 8 && best > 0; k++) {
-            const double gap = GAP + 16 * ring, cx = x + direction[k][0] * (gap + w / 2), cy = y + direction[k][1] * (gap + (direction[k][0] != 0 ? 0 : h / 2));
-            const struct box b = { cx - w / 2, cy - h / 2, cx + w / 2, cy + h / 2 };
+            const double gap = GAP + (large ? 3 : 0) + 14 * ring, cx = x + direction[k][0] * (gap + w / 2), cy = y + direction[k][1] * (gap + (direction[k][0] != 0 ? 0 : h / 2));
+            const struct box b = { cx - w / 2, cy - h / 2, cx + w / 2, cy + h / 2, 1 };
             const double c = crowding(p, &b);
-            if (c < best)
+            if (c < .8 * best) // further off only where that is worth it
                 best = c, found = b, best_distance = ring;
         }
     take_box(p, found);
@@ -191,7 +204,7 @@ static void write_label(FILE *f, struct panel *p, const struct chart_row *r, dou
         fprintf(f, "set arrow from screen %.5f,%.5f to screen %.5f,%.5f nohead lw .5 lc rgb '#999999'\n", x / width, y / height,
                 fmin(fmax(x, found.x0), found.x1) / width, fmin(fmax(y, found.y0), found.y1) / height);
     fprintf(f, "set label '%s' at screen %.5f,%.5f center tc rgb '%s'%s\n", text, tx / width, ty / height, style_of(r)->colour,
-            strcmp(r->axis, "preset") ? "" : " font ',11'");
+            large ? " font ',11'" : "");
 }
 
 static int by_cost(const void *a, const void *b)
@@ -213,7 +226,7 @@ static int line_of(const struct panel *p, const char *axis, const struct chart_r
     int n = 0;
     for (int i = 0; i < p->n; i++) {
         const struct chart_row *r = &p->rows[i];
-        if (in_panel(p, i) && drawn(r) && (!strcmp(axis, "front") ? chart_on_front(p->rows, p->n, i) : !strcmp(r->axis, axis) || !strcmp(r->axis, "base")))
+        if (in_panel(p, i) && drawn(r, p->measure) && (!strcmp(axis, "front") ? chart_on_front(p->rows, p->n, i, p->measure) : !strcmp(r->axis, axis) || !strcmp(r->axis, "base")))
             line[n++] = r;
     }
     qsort(line, (size_t)n, sizeof(*line), !strcmp(axis, "lights") || !strcmp(axis, "texture") ? by_value : by_cost);
@@ -232,10 +245,10 @@ static void write_panel(FILE *f, struct panel *p, int index, const struct chart_
         if (!in_panel(p, i))
             continue;
         any = r;
-        if (drawn(r)) {
+        if (drawn(r, p->measure)) {
             double x, y;
             place_px(p, r, &x, &y);
-            take_box(p, (struct box){ x - 6, y - 6, x + 6, y + 6 });
+            take_box(p, (struct box){ x - 6, y - 6, x + 6, y + 6, 1 });
         } else {
             char label[CHART_NAME_MAX];
             chart_label(label, sizeof(label), r);
@@ -243,6 +256,8 @@ static void write_panel(FILE *f, struct panel *p, int index, const struct chart_
             snprintf(failed + used, sizeof(failed) - used, "%s%s", used ? ", " : "no figure: ", label);
         }
     }
+    if (*failed)
+        take_box(p, (struct box){ p->area.x0, p->area.y1 - 12 - LINE_HEIGHT, p->area.x0 + 8 + CHARACTER_WIDTH * (double)strlen(failed), p->area.y1, 1 });
     for (int k = 0; k < 5; k++) {
         const int n = line_of(p, lines[k], line);
         fprintf(f, "$line%d_%d << EOD\n", index, k);
@@ -251,11 +266,20 @@ static void write_panel(FILE *f, struct panel *p, int index, const struct chart_
         for (int i = 0; i < n; i++)
             base = k >= 3 && !strcmp(line[i]->axis, "base") ? line[i] : base;
         for (int i = 0; i < n; i++) {
-            if (k == 0 && i > 0) // a front is a stair
-                fprintf(f, "%.6g %.6g\n", line[i]->cpu_s, chart_error_percent(line[i - 1]));
+            const struct chart_row *from = base ? base : i > 0 ? line[i - 1] : line[i];
+            double x0, y0, x1, y1;
+            place_px(p, from, &x0, &y0);
+            place_px(p, line[i], &x1, &y1);
+            if (k == 0) { // a front is a stair
+                take_line(p, x0, y0, x1, y0);
+                take_line(p, x1, y0, x1, y1);
+                fprintf(f, "%.6g %.6g\n", line[i]->cpu_s, chart_error_percent(from, p->measure));
+            } else {
+                take_line(p, x0, y0, x1, y1);
+            }
             if (base)
-                fprintf(f, "%.6g %.6g\n", base->cpu_s, chart_error_percent(base));
-            fprintf(f, "%.6g %.6g\n%s", line[i]->cpu_s, chart_error_percent(line[i]), base ? "\n" : "");
+                fprintf(f, "%.6g %.6g\n", base->cpu_s, chart_error_percent(base, p->measure));
+            fprintf(f, "%.6g %.6g\n%s", line[i]->cpu_s, chart_error_percent(line[i], p->measure), base ? "\n" : "");
         }
         if (n == 0)
             fprintf(f, "NaN NaN\n");
@@ -266,9 +290,9 @@ static void write_panel(FILE *f, struct panel *p, int index, const struct chart_
         fprintf(f, "$points%d_%d << EOD\n", index, s);
         for (int i = 0; i < p->n; i++) {
             const struct chart_row *r = &p->rows[i];
-            if (!in_panel(p, i) || !drawn(r) || style_of(r) != &styles[s])
+            if (!in_panel(p, i) || !drawn(r, p->measure) || style_of(r) != &styles[s])
                 continue;
-            fprintf(f, "%.6g %.6g %d\n", r->cpu_s, chart_error_percent(r), r->trusted ? styles[s].filled : styles[s].hollow);
+            fprintf(f, "%.6g %.6g %d\n", r->cpu_s, chart_error_percent(r, p->measure), r->trusted ? styles[s].filled : styles[s].hollow);
             n++;
         }
         fprintf(f, "%sEOD\n", n ? "" : "NaN NaN 1\n");
@@ -276,13 +300,15 @@ static void write_panel(FILE *f, struct panel *p, int index, const struct chart_
     // Presets first: they have the best places.
     for (int pass = 0; pass < 2; pass++)
         for (int i = 0; i < p->n; i++)
-            if (in_panel(p, i) && drawn(&p->rows[i]) && (pass == 0) == !strcmp(p->rows[i].axis, "preset"))
+            if (in_panel(p, i) && drawn(&p->rows[i], p->measure) && (pass == 0) == !strcmp(p->rows[i].axis, "preset"))
                 write_label(f, p, &p->rows[i], width, height);
     if (*failed)
         fprintf(f, "set label '%s' at screen %.5f,%.5f left tc rgb '#c00000'\n", failed, (p->area.x0 + 8) / width, (p->area.y1 - 12) / height);
     fprintf(f, "set lmargin at screen %.5f; set rmargin at screen %.5f; set bmargin at screen %.5f; set tmargin at screen %.5f\n",
             p->area.x0 / width, p->area.x1 / width, p->area.y0 / height, p->area.y1 / height);
-    if (any)
+    if (p->measure == CHART_SAMPLES)
+        fprintf(f, "set title '%s: at texel centres'\n", p->set);
+    else if (any)
         fprintf(f, "set title '%s: %lld views of %lldx%lld pixels, %lld held out'\n", p->set, (long long)any->n_views, (long long)any->width_px,
                 (long long)any->height_px, (long long)any->n_held_out);
     fprintf(f, "set xrange [%.6g:%.6g]; set yrange [%.6g:%.6g]\n", p->low[0], p->high[0], p->low[1], p->high[1]);
@@ -311,7 +337,7 @@ static void write_key(FILE *f, double width, double height, const char *caption)
                 order[k] == 5 ? "2" : "1.3", s->colour, s->colour);
         x += 36 + CHARACTER_WIDTH * (double)strlen(s->text) + 10;
     }
-    fprintf(f, "set label 'hollow: the solve says itself that it is not to be trusted. Grey: nothing is both cheaper and better. Each line leaves the base in one setting.' "
+    fprintf(f, "set label 'hollow: the solve says itself that it is not to be trusted. Grey: nothing cheaper is as good. Each line leaves the base in one setting.' "
                "at screen %.5f,%.5f left tc rgb '#444444'\n", (LEFT - 6) / width, 44 / height);
     fprintf(f, "set label '%s' at screen %.5f,%.5f left tc rgb '#444444'\n", caption, (LEFT - 6) / width, 22 / height);
 }
@@ -333,18 +359,21 @@ static int list_sets(const char **sets, const struct chart_row *rows, int n)
 static void write_script(FILE *f, const struct chart_row *rows, int n, const char **sets, int n_sets, const struct chart_row **line, struct panel *p,
                          const char *caption)
 {
-    const int columns = n_sets < 3 ? n_sets : n_sets == 4 ? 2 : 3, n_rows = (n_sets + columns - 1) / columns;
+    const int columns = n_sets < 3 ? n_sets : n_sets == 4 ? 2 : 3, n_rows = N_MEASURES * ((n_sets + columns - 1) / columns);
     const double width = fmax(columns, 2) * PANEL_WIDTH, height = HEAD + FOOT + n_rows * PANEL_HEIGHT;
     // Data blocks cannot stand in a loop, so the script runs itself a second time.
     fprintf(f, "# drawn by rigsolve chart; to draw it again, here: gnuplot chart.gp\nset encoding utf8\nif (!exists('again')) { again = 0 }\n"
                "if (again) { set terminal pngcairo size %.0f,%.0f noenhanced font 'sans,9'; set output 'chart.png' }\n"
                "if (!again) { set terminal svg size %.0f,%.0f noenhanced font 'sans,11' background 'white'; set output 'chart.svg' }\n", width, height, width, height);
-    fprintf(f, "set multiplot\nset logscale xy\nset grid lc rgb '#e4e4e4'\nunset key\n");
-    for (int k = 0; k < n_sets; k++) {
-        const int column = k % columns, row = k / columns;
+    fprintf(f, "set multiplot\nset logscale xy\nset grid lt 1 lw .5 lc rgb '#dddddd'\nunset key\n");
+    for (int k = 0; k < N_MEASURES * n_sets; k++) {
+        const int set = k / N_MEASURES, measure = k % N_MEASURES, column = set % columns, row = N_MEASURES * (set / columns) + measure;
         const double x0 = column * PANEL_WIDTH, y1 = height - HEAD - row * PANEL_HEIGHT;
-        *p = (struct panel){ .rows = rows, .n = n, .set = sets[k], .area = { x0 + LEFT, y1 - PANEL_HEIGHT + BOTTOM, x0 + PANEL_WIDTH - RIGHT, y1 - TOP } };
-        fprintf(f, "set xlabel 'CPU seconds of the solve'\nset ylabel '%s'\n", column ? "" : "error of views held out, RMSE in % of white");
+        *p = (struct panel){ .rows = rows, .n = n, .set = sets[set], .measure = measure,
+                             .area = { x0 + LEFT, y1 - PANEL_HEIGHT + BOTTOM, x0 + PANEL_WIDTH - RIGHT, y1 - TOP, 0 } };
+        fprintf(f, "set xlabel 'CPU seconds of the solve'\nset ylabel '%s'\n", column                       ? ""
+                                                                                : measure == CHART_PICTURES ? "held-out views, rendered again: RMSE, % of white"
+                                                                                                            : "held-out samples of texels: RMSE, % of white");
         write_panel(f, p, k, line, width, height);
     }
     write_key(f, width, height, caption);

@@ -18,10 +18,11 @@ struct chart_row {
     double rmse_pictures_percent; // views held out, rendered again, against their photographs; NAN: not known
 };
 
-// The row's error on the chart: pictures, else NAN.
-double chart_error_percent(const struct chart_row *row);
-// No solved row of the same set is both cheaper and better. n rows, of any set.
-bool chart_on_front(const struct chart_row *rows, int n, int i);
+// Two errors are drawn, a panel each: of pictures, and of samples at texel centres (rmse_held_out_percent).
+enum chart_measure { CHART_PICTURES, CHART_SAMPLES };
+double chart_error_percent(const struct chart_row *row, enum chart_measure measure); // NAN: not solved, or not known
+// No solved row of the same set is cheaper and at most 1 % (of it) worse. n rows, of any set.
+bool chart_on_front(const struct chart_row *rows, int n, int i, enum chart_measure measure);
 // "N=64", "texture 32", "avx2", "standard": what the row is called on the chart.
 void chart_label(char *out, int size, const struct chart_row *row);
 
