@@ -87,7 +87,7 @@ static const char doc[] =
     "own and becomes one row of chart.csv: settings, CPU and wall seconds, peak memory, and three errors, RMSE in percent of white: "
     "of samples fitted, of samples of views held out (both at texel centres), and of pictures: up to three held-out views rendered again and compared with the "
     "photographs inside the object's outline. The last two are drawn over CPU seconds. A solve that fails is a row, too; take the row out of chart.csv to have it solved again. "
-    "A chart that was interrupted goes on where it was. "
+    "A chart that was interrupted goes on where it was; it shows the rows that were asked for, chart.csv keeps all. "
     "The pictures are drawn by gnuplot; without it there are chart.csv and chart.gp, and a warning.\n\n"
     "Exit status: 0 done, with solves that failed or are not to be trusted marked as such; 1 failed, 2 usage.";
 
@@ -111,7 +111,9 @@ static void check_room(const struct argp_state *state, const char *option, int n
 static void parse_integers(const struct argp_state *state, const char *option, char *text, bool power_of_two, int most, int *out, int *n)
 {
     *n = 0;
-    for (char *word; strcmp(text, "none") && (word = next_value(state, option, &text));) {
+    if (!strcmp(text, "none"))
+        return;
+    for (char *word; (word = next_value(state, option, &text));) {
         const int value = power_of_two ? argument_power_of_two(state, option, word, most) : (int)argument_integer(state, option, word, 4, most);
         bool twice = false;
         for (int i = 0; i < *n; i++)
@@ -119,15 +121,15 @@ static void parse_integers(const struct argp_state *state, const char *option, c
         check_room(state, option, *n);
         if (!twice)
             out[(*n)++] = value;
-        if (!text)
-            return;
     }
 }
 
 static void parse_names(const struct argp_state *state, const char *option, char *text, const char *const *names, int n_names, const char **out, int *n)
 {
     *n = 0;
-    for (char *word; strcmp(text, "none") && (word = next_value(state, option, &text));) {
+    if (!strcmp(text, "none"))
+        return;
+    for (char *word; (word = next_value(state, option, &text));) {
         const char *value = names[argument_choice(state, option, word, names, n_names)];
         bool twice = false;
         for (int i = 0; i < *n; i++)
@@ -135,8 +137,6 @@ static void parse_names(const struct argp_state *state, const char *option, char
         check_room(state, option, *n);
         if (!twice)
             out[(*n)++] = value;
-        if (!text)
-            return;
     }
 }
 

@@ -244,7 +244,7 @@ static void write_panel(FILE *f, struct panel *p, int index, const struct chart_
         const struct chart_row *r = &p->rows[i];
         if (!in_panel(p, i))
             continue;
-        any = r;
+        any = any && !r->solved ? any : r; // a failed one does not know how many were held out
         if (drawn(r, p->measure)) {
             double x, y;
             place_px(p, r, &x, &y);
