@@ -318,7 +318,7 @@ static void write_panel(FILE *f, struct panel *p, int index, const struct chart_
     for (int k = 1; k < 5; k++)
         fprintf(f, ", \\\n  $line%d_%d using 1:2 with lines lc rgb '%s' lw 1.2%s", index, k, styles[k].colour, k >= 3 ? " dt 3" : "");
     for (int s = 0; s < N_STYLES; s++)
-        fprintf(f, ", \\\n  $points%d_%d using 1:2:3 with points pt variable ps %s lw 1.5 lc rgb '%s'", index, s, s == N_STYLES - 1 ? "2" : "1.3",
+        fprintf(f, ", \\\n  $points%d_%d using 1:2:3 with points pt variable ps %s lw 1.5 lc rgb '%s'", index, s, s == N_STYLES - 1 ? "large" : "small",
                 styles[s].colour);
     fprintf(f, "\n");
 }
@@ -333,8 +333,8 @@ static void write_key(FILE *f, double width, double height, const char *caption)
     fprintf(f, "\n# ---- key\nunset label; unset arrow\n");
     for (int k = 0; k < N_STYLES; k++) {
         const struct style *s = &styles[order[k]];
-        fprintf(f, "set label '%s' at screen %.5f,%.5f left offset 1,0 point pt %d ps %s lc rgb '%s' tc rgb '%s'\n", s->text, x / width, 66 / height, s->filled,
-                order[k] == 5 ? "2" : "1.3", s->colour, s->colour);
+        fprintf(f, "set label '%s' at screen %.5f,%.5f left offset 1.2,0 point pt %d ps %s lc rgb '%s' tc rgb '%s'\n", s->text, x / width, 66 / height, s->filled,
+                order[k] == 5 ? "large" : "small", s->colour, s->colour);
         x += 36 + CHARACTER_WIDTH * (double)strlen(s->text) + 10;
     }
     fprintf(f, "set label 'hollow: the solve says itself that it is not to be trusted. Grey: nothing cheaper is as good. Each line leaves the base in one setting.' "
@@ -364,7 +364,8 @@ static void write_script(FILE *f, const struct chart_row *rows, int n, const cha
     // Data blocks cannot stand in a loop, so the script runs itself a second time.
     fprintf(f, "# drawn by rigsolve chart; to draw it again, here: gnuplot chart.gp\nset encoding utf8\nif (!exists('again')) { again = 0 }\n"
                "if (again) { set terminal pngcairo size %.0f,%.0f noenhanced font 'sans,9'; set output 'chart.png' }\n"
-               "if (!again) { set terminal svg size %.0f,%.0f noenhanced font 'sans,11' background 'white'; set output 'chart.svg' }\n", width, height, width, height);
+               "if (!again) { set terminal svg size %.0f,%.0f noenhanced font 'sans,11' background 'white'; set output 'chart.svg' }\n"
+               "small = again ? 1.3 : .8; large = again ? 2 : 1.2 # marks\n", width, height, width, height);
     fprintf(f, "set multiplot\nset logscale xy\nset grid lt 1 lw .5 lc rgb '#dddddd'\nunset key\n");
     for (int k = 0; k < N_MEASURES * n_sets; k++) {
         const int set = k / N_MEASURES, measure = k % N_MEASURES, column = set % columns, row = N_MEASURES * (set / columns) + measure;
