@@ -78,6 +78,10 @@ gives 0 "the same chart with one texture more" "$rigsolve" chart D3 -o "$dir/cha
 result $? "solves that one alone, and keeps the others"
 perl -MJSON::PP -ne 'next unless /^\[/; $d = decode_json($_); exit(@$d == 5 && $d->[0]{axis} eq "base" && $d->[0]{cpu_s} > 0 && exists $d->[0]{on_front_of_pictures} ? 0 : 1)' "$dir/log"
 result $? "its JSON lists what was asked for"
+gives 0 "a chart of rows that are there and of one that is not, without solving" "$rigsolve" chart D3 -o "$dir/chart" $tiny --presets none --texture 16,64 --no-solve
+[ "$(ls "$dir/chart/solves")" = D3-texture_16.log ] && grep -q "'texture 16'" "$dir/chart/chart.gp" && ! grep -q "'texture 64'" "$dir/chart/chart.gp"
+result $? "draws those that are there"
+gives 1 "nothing to draw is refused" "$rigsolve" chart D3 -o "$dir/chart" $tiny --no-solve --seed 2
 sed -i '2d' "$dir/chart/chart.csv"
 gives 0 "a row taken out of the table" "$rigsolve" chart D3 -o "$dir/chart" $tiny --presets none
 table "$dir/chart/chart.csv" '@r == 6 && $r[5]{axis} eq "base"'

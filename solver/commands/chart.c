@@ -48,13 +48,13 @@ struct arguments {
     int lights[MAX_VALUES], n_lights, textures[MAX_VALUES], n_textures, n_methods, n_kernels, n_presets; // values of each axis
     const char *methods[MAX_VALUES], *kernels[MAX_VALUES], *presets[MAX_VALUES];
     int base_lights, base_texture, n_views, width_px, height_px, n_threads, preset_scale;
-    bool has_lights, has_textures, has_methods, has_kernels, has_presets, keep, json;
+    bool has_lights, has_textures, has_methods, has_kernels, has_presets, keep, no_solve, json;
     uint64_t seed;
 };
 
 enum {
     KEY_LIGHTS = 256, KEY_TEXTURE, KEY_METHODS, KEY_KERNELS, KEY_PRESETS, KEY_BASE_LIGHTS, KEY_BASE_TEXTURE, KEY_PRESET_SCALE, KEY_HOLD_OUT, KEY_SIZE, KEY_VIEWS, KEY_SEED,
-    KEY_THREADS, KEY_KEEP, KEY_JSON,
+    KEY_THREADS, KEY_KEEP, KEY_NO_SOLVE, KEY_JSON,
 };
 
 static const struct argp_option options[] = {
@@ -76,6 +76,7 @@ static const struct argp_option options[] = {
     { "threads", KEY_THREADS, "N", 0, "default: all cores; CPU seconds hardly depend on it", 2 },
     { 0, 0, 0, 0, "Output", 3 },
     { "keep", KEY_KEEP, 0, 0, "leave every solve's folder in DIR/solves", 3 },
+    { "no-solve", KEY_NO_SOLVE, 0, 0, "draw what of it is in chart.csv already", 3 },
     { "json", KEY_JSON, 0, 0, "print the rows as JSON", 3 },
     { 0 },
 };
@@ -200,6 +201,9 @@ static error_t parse(int key, char *text, struct argp_state *state)
         return 0;
     case KEY_KEEP:
         a->keep = true;
+        return 0;
+    case KEY_NO_SOLVE:
+        a->no_solve = true;
         return 0;
     case KEY_JSON:
         a->json = true;
@@ -851,12 +855,19 @@ static int solve_all(struct table *t, struct table *chosen, const struct set *se
         else
             cost_left += expected_cost(&point[i]);
     }
+    if (!err && !n_found && a->no_solve) {
+        log_error("chart: %s: has none of the rows asked for; run without --no-solve", csv_path);
+        err = -ENOENT;
+    }
     if (n_found)
         log_info("chart: %d of %d rows are in %s already", n_found, n, csv_path);
-    if (n > n_found)
+    const bool solves = n > n_found && !a->no_solve;
+    if (solves)
         progress_begin("chart", n - n_found);
     for (int i = 0, done = n_found; !err && i < n; i++) {
         const struct chart_row *found = find_row(t, &point[i]);
+        if (!found && a->no_solve)
+            continue;
         const bool named = found && !strcmp(found->axis, point[i].axis) && !strcmp(found->preset, point[i].preset);
         struct chart_row row = found ? *found : point[i];
         if (!found) {
@@ -878,7 +889,7 @@ static int solve_all(struct table *t, struct table *chosen, const struct set *se
         if (!err)
             err = add_row(chosen, &row);
     }
-    if (n > n_found)
+    if (solves)
         progress_end();
     free(point);
     return err;
