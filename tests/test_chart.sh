@@ -106,7 +106,7 @@ cut -d, -f1-8,20-22 "$dir/torn/chart.csv" | head -n 5 | LC_ALL=C sort >"$dir/one
 result $? "with the errors of one that was not"
 
 # A take that cannot be solved is a row, and the others are solved all the same
-one=$(ls -d "$dir/chart/takes/"D3-*[0-9])
+one=$dir/chart/takes/D3-60x40-12-1
 cp -r "$one" "$dir/broken, really" && head -c 3000 "$one/panorama.exr" >"$dir/broken, really/panorama.exr"
 cp -r "$one" "$dir/own"
 few="--hold-out every:4 --base-lights 16 --base-texture 8 --lights none --texture none --methods alternating --kernels none --presets none --threads 2"
