@@ -11,12 +11,12 @@ BUILD := build$(if $(filter-out release,$(VARIANT)),/$(VARIANT))
 MACHINE := $(shell uname -m)
 
 # ---- packages (Debian 12; the same names in Debian 13) ----------------------------------------------------------------
-PACKAGES := gcc make pkg-config libopenexr-dev libembree-dev libassimp-dev libjansson-dev libtiff-dev libpng-dev libjpeg-dev libexpat1-dev liblapacke-dev libopenblas-dev libcmocka-dev perl help2man dcraw \
+PACKAGES := gcc make pkg-config libopenexr-dev libembree-dev libassimp-dev libjansson-dev libtiff-dev libpng-dev libjpeg-dev libexpat1-dev liblapacke-dev libopenblas-dev libcmocka-dev perl help2man dcraw gnuplot-nox \
   libgphoto2-dev libgpiod-dev libinih-dev libmicrohttpd-dev libraw-dev libsystemd-dev libumockdev-dev umockdev libusb-1.0-0-dev libxxhash-dev \
   gcc-avr avr-libc libsimavr-dev libelf-dev
 PACKAGES_TEST := chromium gphoto2 libimage-exiftool-perl hugin-tools libsuitesparse-dev
 PACKAGES_FUZZ := clang libclang-rt-dev
-PACKAGES_BENCH := libceres-dev g++ gnuplot-nox
+PACKAGES_BENCH := libceres-dev g++
 
 # ---- flags --------------------------------------------------------------------------------------------------------------
 FLAGS_release := -O2 -g
@@ -221,9 +221,12 @@ bench-studios: deps all $(addprefix $(BUILD)/tests/bench/,judge judge_materials 
 	@BIN=$(BUILD)/bin TOOLS=$(BUILD)/tests/bench sh tests/bench/studios.sh $(STUDIOS)
 experiments: deps $(BUILD)/bin/rigsolve $(BUILD)/tests/bench/judge
 	@BIN=$(BUILD)/bin JUDGE=$(BUILD)/tests/bench/judge sh tests/bench/experiments.sh
-chart: deps deps-bench $(BUILD)/tests/bench/chart_lights
+CHART_TAKES ?= D3 D5 $(wildcard ../shared/data/studio-pebble)
+chart: deps $(BUILD)/bin/rigsolve $(BUILD)/tests/bench/chart_lights
 	@mkdir -p build/chart && $(BUILD)/tests/bench/chart_lights >build/chart/lights.csv && gnuplot -e "out='build/chart/lights'" tests/bench/chart_lights.gp
 	@echo "chart: build/chart/lights.csv .svg .png: seconds against error over N, roughness and kernel"
+	@$(BUILD)/bin/rigsolve chart $(CHART_TAKES) $(CHART_OPTIONS) -o build/chart
+	@echo "chart: build/chart/chart.csv .svg .png: CPU seconds of a solve against its error: N, texture, method, kernel, presets"
 figure5: deps deps-bench $(BUILD)/tests/bench/figure5
 	@mkdir -p build/figure5 && $(BUILD)/tests/bench/figure5 build/figure5 >build/figure5/figure5.csv && gnuplot -e "out='build/figure5/figure5'" tests/bench/figure5.gp
 	@echo "figure5: build/figure5/figure5.csv .svg .png: the paper's Figure 5: w_sim x start x true lights"
@@ -238,7 +241,7 @@ stability: deps deps-bench $(BUILD)/tests/bench/stability_kernels $(BUILD)/tests
 	@echo "stability: build/stability/joint.csv .svg .png: where the lights are found, where not, and whether the solver says so"
 
 # ---- installation ---------------------------------------------------------------------------------------------------------
-MAN := $(addprefix $(BUILD)/man/rigsolve,.1 $(addprefix -,$(addsuffix .1,$(filter-out arguments inputs output solve_materials solved,$(notdir $(COMMANDS:.c=))))))
+MAN := $(addprefix $(BUILD)/man/rigsolve,.1 $(addprefix -,$(addsuffix .1,$(filter-out arguments chart_draw inputs output solve_materials solved,$(notdir $(COMMANDS:.c=))))))
 RIG_MAN := $(addprefix $(BUILD)/man/,rigctl.1 rigctl-develop.1 rigctl-calibrate-colour.1 rigd-develop.1 rigd.8)
 man: $(MAN) $(RIG_MAN)
 $(BUILD)/man/rigctl.1: $(BUILD)/bin/rigctl

@@ -20,6 +20,7 @@ static const struct {
     { "export", command_export, "write a solved material as GLB, MaterialX, OBJ or for Blender" },
     { "report", command_report, "write a page for people about a solve" },
     { "compare", command_compare, "RMSE and PSNR of two pictures" },
+    { "chart", command_chart, "speed against accuracy: settings, methods and presets, as CSV, SVG, PNG" },
     { "brdf", command_brdf, "evaluate the Disney BRDF and its derivatives for a table of cases" },
 };
 enum { N_COMMANDS = sizeof(commands) / sizeof(commands[0]) };

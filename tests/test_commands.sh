@@ -108,6 +108,10 @@ result $? "same textures, to the byte"
 gives 0 "the paper's plain fit" "$rigsolve" solve "$dir/one" -o "$dir/plain" $under --method alternating
 json_has "$dir/plain/report.json" '@{$d->{stages}{materials}{regions}} == 0'
 result $? "without regions"
+"$rigsolve" solve "$dir/one" -o "$dir/far" --method directional --texture 32 --lights 64 >"$dir/log" 2>&1
+got=$?
+[ $got = 0 ] || [ $got = 3 ] && [ -s "$dir/far/std.exr" ]
+result $? "directional lights leave the centre open, and textures with finite doubts all the same"
 gives 2 "no stage 1 and nothing after it is a usage error" "$rigsolve" solve "$dir/one" -o "$dir/refused" --lights-from x --stage 1
 refuses "lights that are not there are named" 'nowhere\.json' "$rigsolve" solve "$dir/one" -o "$dir/refused" --lights-from "$dir/nowhere.json"
 # Killed at any moment: no file that is not whole, and a second run as if nothing had been

@@ -14,3 +14,4 @@ int command_render(int argc, char **argv);
 int command_compare(int argc, char **argv);
 int command_export(int argc, char **argv);
 int command_report(int argc, char **argv);
+int command_chart(int argc, char **argv);

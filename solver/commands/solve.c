@@ -6,6 +6,7 @@
 #include "solver/commands/report.h"
 #include "solver/commands/solve_materials.h"
 #include "solver/joint.h"
+#include "solver/kernels/kernels.h"
 #include "solver/parallel.h"
 #include "solver/samples.h"
 #include "solver/take/atomic_file.h"
@@ -321,6 +322,7 @@ static struct json *make_report(const struct scene *scene, const struct settings
                 *stage1 = json_object();
     json_set_string(o, "method", method_names[s->joint.method]);
     json_set_string(o, "preset", s->preset->name);
+    json_set_string(o, "kernel", kernels_select(KERNELS_ALL)->name);
     json_set_int(o, "seed", (int64_t)s->seed);
     json_set_int(o, "threads", s->n_threads > 0 ? s->n_threads : parallel_n_cores());
     json_set_number(o, "wall_s", wall);
