@@ -5,6 +5,7 @@
 #   rig.pl faults [PAIRS [WHICH]] one of 12 cameras misbehaves: when is it back or out, what do the others notice
 #   rig.pl soak [N]               N takes: descriptors, memory, processes
 #   rig.pl lag [SHOTS]            calibration against the wires' truth
+#   rig.pl hundred                100 cameras: preflight, settings, status and identify, calibration; and links of known speed
 #   rig.pl full                   the disk fills in the middle of a take (a small tmpfs: needs root)
 #   rig.pl eio                    the disk fails in the middle of a take
 # Environment: BIN (build/bin), TMPDIR (a folder on the disk to be measured; kills and faults prefer /dev/shm), SEED, KEEP=1 keeps
@@ -628,6 +629,86 @@ sub lag {
     promise($skew <= .25 * 1.5, sprintf 'after calibration only the bodies\' jitter (.25 ms) is left: sigma %.2f ms', $skew);
 }
 
+# ---- a hundred bodies ------------------------------------------------------------------------------------------------------------
+
+sub preflight_s { # and what it found
+    my ($r) = @_;
+    my $t = now();
+    my $a = request($r, 'preflight') // die "rigd left\n";
+    return (now() - $t, $a->{result});
+}
+
+sub hundred {
+    my $r = new_rig(ram => 1, cameras => 100, trigger => "half_press_ms = 60\nhold_ms = 100", set => ['lag_ms=117', 'lag_spread_ms=3', 'lag_jitter_ms=.25']);
+    start_rigd($r);
+    ready($r) or die "100 cameras do not come up\n";
+    my @s;
+    for (1 .. 3) {
+        my ($s, $found) = preflight_s($r);
+        promise(0, 'preflight finds the rig unfit: ' . encode_json($found->{findings}[0])) if !$found->{fit};
+        push @s, $s;
+    }
+    promise(max(@s) <= 3, sprintf 'preflight of 100 bodies that are as they should be, in <= 3 s: %s s', join ', ', map { sprintf '%.2f', $_ } @s);
+
+    my (@status_ms, @identify_ms);
+    for my $k (1 .. 50) {
+        my $t = now();
+        request($r, 'status');
+        push @status_ms, 1e3 * (now() - $t);
+    }
+    my $camera = request($r, 'status')->{result}{cameras}[41]{name};
+    for (1 .. 5) {
+        my $t = now();
+        my $a = request($r, 'identify', camera => $camera);
+        push @identify_ms, 1e3 * (now() - $t);
+        promise(0, "identify $camera: $a->{error}{text}") if !$a->{ok};
+    }
+    promise(max(@status_ms) <= 200, sprintf 'the state of 100 cameras in <= 200 ms: median %.1f ms, most %.1f ms', median(@status_ms), max(@status_ms));
+    promise(max(@identify_ms) <= 10000, sprintf 'identify tells its camera in <= 10 s: most %.0f ms', max(@identify_ms));
+
+    my $t = now();
+    my $a = request($r, 'calibrate', what => 'lag', shots => 32, patience => 500);
+    my $s = now() - $t;
+    my @lag = @{$a->{result}{lag} // []};
+    promise(@lag == 100 && $s <= 300, sprintf 'lag of %d bodies in <= 300 s: %.0f s, n = %d..%d', scalar @lag, $s, min(map { $_->{n} } @lag), max(map { $_->{n} } @lag));
+    my $shot = capture($r)->{result};
+    promise(defined $shot->{spread_ms} && defined $shot->{sigma_ms}, sprintf 'a shot reports its spread and sigma: %.2f ms, %.2f ms', $shot->{spread_ms} // -1, $shot->{sigma_ms} // -1);
+
+    # The same bodies are told something else: every setting of theirs that can be changed.
+    end(delete $r->{rigd});
+    my %other = (iso => '400', aperture => '11', shutter => '1/60', whitebalance => 'tungsten');
+    my $config = slurp("$r->{dir}/rigd.conf");
+    $config =~ s/^\Q$_\E = .*\n//m for keys %other;
+    $config =~ s/^\[settings\]\n/"[settings]\n" . join '', map { "$_ = $other{$_}\n" } sort keys %other/me;
+    open(my $c, '>', "$r->{dir}/rigd.conf") or die;
+    print $c $config;
+    close $c;
+    start_rigd($r);
+    ready($r) or die "100 cameras do not come up again\n";
+    my ($told_s, $found) = preflight_s($r);
+    print "    $_->{severity} $_->{camera}: $_->{text}\n" for @{$found->{findings}}[0 .. min(2, $#{$found->{findings}})];
+    promise($found->{fit} && $told_s <= 2, sprintf '%d settings of 100 bodies in <= 2 s, read back, preflight included: %.2f s', scalar keys %other, $told_s);
+    stop($r);
+
+    links($_, 2e6) for 8, 16;
+}
+
+# Every camera's link carries so many bytes a second.
+sub links {
+    my ($n, $rate) = @_;
+    my $r = new_rig(ram => 1, cameras => $n, raw => '2448x1632', rig => "raw_mb = 9\nfree_space_mb = 100\nfetch_limit = $n\n", faults => "* at 0s slow $rate\n");
+    start_rigd($r);
+    ready($r) or die "$n cameras do not come up\n";
+    capture($r, name => 'warm');
+    my $shot = capture($r, name => 'links')->{result};
+    my $copied_s = max(map { 1e-3 * ($_->{copied_ms} // 0) } map { @{$_->{files}} } @{report($r, $shot->{id})->{cameras}});
+    my $ideal_s = $shot->{bytes} / ($n * $rate);
+    my $cpu_s = cpu_s($r->{sim}) + sum(map { cpu_s($_) } $r->{rigd}, workers($r));
+    promise($ideal_s >= .85 * $copied_s, sprintf 'links of %d x %.0f MB/s used to >= 85 %%: %.1f %% (all safe %.2f s after the shot, names, thumbnails and checks included; the bytes alone need %.2f s; processor of everything so far %.1f s)',
+        $n, 1e-6 * $rate, 100 * $ideal_s / $copied_s, $copied_s, $ideal_s, $cpu_s);
+    stop($r);
+}
+
 # ---- full and failing disks ------------------------------------------------------------------------------------------------------
 
 # Every file under its final name is whole: a TIFF that LibRaw's size agrees with is not asked for, only the size that all share.
@@ -717,7 +798,7 @@ sub eio {
     }
 }
 
-my %commands = (kills => \&kills, scale => \&scale, faults => \&faults, soak => \&soak, lag => \&lag, full => \&full, eio => \&eio);
+my %commands = (kills => \&kills, scale => \&scale, faults => \&faults, soak => \&soak, lag => \&lag, hundred => \&hundred, full => \&full, eio => \&eio);
 my $what = shift // '';
 $SIG{INT} = $SIG{TERM} = sub { exit 2 };
 my $main = $$;
