@@ -15,7 +15,7 @@ PACKAGES := gcc make pkg-config libopenexr-dev libembree-dev libassimp-dev libja
   libgphoto2-dev libgpiod-dev libinih-dev libmicrohttpd-dev libraw-dev libsystemd-dev libumockdev-dev libusb-1.0-0-dev libxxhash-dev \
   gcc-avr avr-libc libsimavr-dev libelf-dev
 PACKAGES_FUZZ := clang libclang-rt-dev
-PACKAGES_BENCH := libceres-dev g++ gnuplot-nox
+PACKAGES_BENCH := libceres-dev g++ gnuplot-nox time
 
 # ---- flags --------------------------------------------------------------------------------------------------------------
 FLAGS_release := -O2 -g
@@ -52,10 +52,10 @@ FUZZED := $(LIBRARY) $(RIG) $(RIGSIM_LIB) $(FIRMWARE_SIM) # what a fuzzer calls 
 
 # ---- rules --------------------------------------------------------------------------------------------------------------
 object = $(patsubst %.c,$(BUILD)/obj/%.o,$(1))
-ifneq ($(filter firmware test test-vm demo bench bench-develop bench-firmware bench-panorama bench-rig chart figure5 figures stability experiments,$(MAKECMDGOALS)),)
+ifneq ($(filter firmware test test-vm demo bench bench-develop bench-firmware bench-panorama bench-rig chart figure5 figures results stability experiments,$(MAKECMDGOALS)),)
 FIRST := deps # these install what is missing before the first file is compiled
 endif
-.PHONY: all firmware deps deps-fuzz deps-bench test test-vm demo bench bench-develop bench-firmware bench-panorama bench-rig chart figure5 figures stability experiments fuzz check-includes man install clean help
+.PHONY: all firmware deps deps-fuzz deps-bench test test-vm demo bench bench-develop bench-firmware bench-panorama bench-rig chart figure5 figures results stability experiments fuzz check-includes man install clean help
 .DELETE_ON_ERROR:
 .SECONDARY:
 
@@ -213,6 +213,9 @@ bench-develop: deps all $(BUILD)/tests/bench/raws
 	@BIN=$(BUILD)/bin RAWS=$(BUILD)/tests/bench/raws sh tests/bench/develop.sh
 experiments: deps $(BUILD)/bin/rigsolve $(BUILD)/tests/bench/judge
 	@BIN=$(BUILD)/bin JUDGE=$(BUILD)/tests/bench/judge sh tests/bench/experiments.sh
+RESULTS ?=
+results: deps deps-bench
+	@perl tests/results/measure.pl $(RESULTS)
 chart: deps deps-bench $(BUILD)/tests/bench/chart_lights
 	@mkdir -p build/chart && $(BUILD)/tests/bench/chart_lights >build/chart/lights.csv && gnuplot -e "out='build/chart/lights'" tests/bench/chart_lights.gp
 	@echo "chart: build/chart/lights.csv .svg .png: seconds against error over N, roughness and kernel"
@@ -281,6 +284,7 @@ help:
 	@echo 'make bench      seconds and errors of kernels     make chart     speed against accuracy      make stability  where it fails'
 	@echo 'make bench-panorama  what a merged panorama loses of the one that was photographed, and what 24 megapixels take'
 	@echo 'make bench-rig  the rig with simulated cameras: kills, faults, scale, soak, lag, disks (half an hour; RIG_BENCHES="lag soak")'
+	@echo 'make results    what was promised and what is measured: tests/results/README.md (RESULTS=all; RESULTS="S4 lag")'
 	@echo 'make bench-develop  raws to radiance: seconds and MB per 24-megapixel frame, 85 of them sustained'
 	@echo 'make install    DESTDIR= PREFIX=/usr/local        make deps      Debian packages             make clean'
 	@echo 'variants: VARIANT=debug|asan|tsan; V=1 shows commands'

@@ -408,7 +408,7 @@ sub scale {
     sleep 60; # two heartbeats
     my $s = now() - $begin;
     my ($rigd_pc, $workers_pc, $sim_pc) = map { 100 * $_ / $s } cpu_s($r->{rigd}) - $daemon, sum(map { cpu_s($_) } @w) - $all, cpu_s($r->{sim}) - $sim;
-    promise($rigd_pc + $workers_pc <= 10, sprintf 'idle CPU <= 10%% of a core: rigd %.2f%% + %d workers %.2f%% over %.0f s (rigsim %.2f%%)', $rigd_pc, scalar @w, $workers_pc, $s, $sim_pc);
+    promise($rigd_pc + $workers_pc <= 10, sprintf 'idle CPU <= 10%% of a core: %.2f%%: rigd %.2f%% + %d workers %.2f%% over %.0f s (rigsim %.2f%%)', $rigd_pc + $workers_pc, $rigd_pc, scalar @w, $workers_pc, $s, $sim_pc);
     my @kb = map { private_kb($_) } @w;
     promise(max(@kb) <= 4096, sprintf '<= 4 MB private memory per worker: median %d kB, most %d kB of %d; rigd %d kB', median(@kb), max(@kb), scalar @kb, private_kb($r->{rigd}));
     stop($r);
