@@ -599,8 +599,16 @@ sub true_lag_ms {
     return @lag;
 }
 
+# How far a body opened from the mean of its shot, on average.
+sub misalignment_ms {
+    my ($take) = @_;
+    my @opened_ms = map { 1e-3 * $_->{delay_us} + $_->{lag_ms} } grep { defined $_->{lag_ms} } @{$take->{cameras}};
+    my $mean = sum(@opened_ms) / @opened_ms;
+    return sum(map { abs($_ - $mean) } @opened_ms) / @opened_ms;
+}
+
 sub lag {
-    my ($worst, $skew) = (0, 0);
+    my ($worst, $skew, @misaligned_ms) = (0, 0);
     my $shots_wanted = shift // 60;
     for my $case ([117, 3, 0], [97, 7, 1], [107, 20, 2]) {
         my ($mean, $spread, $seed) = @$case;
@@ -608,7 +616,7 @@ sub lag {
         my @true = true_lag_ms($r);
         start_rigd($r);
         ready($r) or die "does not come up\n";
-        my $shots = sub { map { my $t = capture($r)->{result}; [$t->{spread_ms}, $t->{sigma_ms}] } 1 .. 5 };
+        my $shots = sub { map { my $t = capture($r)->{result}; [$t->{spread_ms}, $t->{sigma_ms}, misalignment_ms(report($r, $t->{id}))] } 1 .. 5 };
         my @before = $shots->();
         my $t = now();
         my $a = request($r, 'calibrate', what => 'lag', shots => $shots_wanted, patience => 300);
@@ -623,9 +631,11 @@ sub lag {
         printf "lag %d +- %d ms, jitter .25 ms, 8 bodies, n = %d..%d, %.0f s: error of the mean %s, most %.3f ms; it says +- %.3f ms\n", $mean, $spread, min(map { $_->{n} } @lag), max(map { $_->{n} } @lag),
             $calibrated_s, join(' ', map { sprintf '%+.3f', $_ } @error), $most, max(map { $_->{error_ms} } @lag);
         printf "    spread of a shot: %.2f ms before, %.2f ms after; sigma %.2f, %.2f ms (medians of 5)\n", $sb, $sa, $gb, $ga;
+        push @misaligned_ms, sum(map { $_->[2] } @after) / @after;
         stop($r);
     }
     promise($worst <= .1, sprintf 'lag: mean to +-.1 ms with n >= 30: %.3f ms (of a jitter of .25 ms, %d shots leave a sigma of %.3f ms by themselves)', $worst, $shots_wanted, .25 / sqrt $shots_wanted);
+    promise(max(@misaligned_ms) <= .25, sprintf 'after calibration a body opens on average <= .25 ms off the mean of its shot: %s ms', join ', ', map { sprintf '%.3f', $_ } @misaligned_ms);
     promise($skew <= .25 * 1.5, sprintf 'after calibration only the bodies\' jitter (.25 ms) is left: sigma %.2f ms', $skew);
 }
 
