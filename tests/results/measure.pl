@@ -95,6 +95,7 @@ sub met {
 
 my %row;
 sub read_figures {
+    %row = ();
     open(my $f, '<', "$here/figures.csv") or return;
     my @names = split /,/, (<$f> // '') =~ s/\n//r;
     while (<$f>) {
@@ -241,10 +242,12 @@ read_figures();
 if (!$page_only) {
     for my $r (map { $run{$_} } @wanted) {
         measure($r) if !$read_only;
+        read_figures(); # another one may have written meanwhile
         read_log($r);
         write_figures(); # a long list that is broken off keeps what it has
     }
 }
+read_figures();
 fill_in();
 write_figures();
 write_page();
