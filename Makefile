@@ -13,9 +13,9 @@ MACHINE := $(shell uname -m)
 # ---- packages (Debian 12; the same names in Debian 13) ----------------------------------------------------------------
 PACKAGES := gcc make pkg-config libopenexr-dev libembree-dev libassimp-dev libjansson-dev libtiff-dev libpng-dev libjpeg-dev libexpat1-dev liblapacke-dev libopenblas-dev libcmocka-dev perl help2man dcraw \
   libgphoto2-dev libgpiod-dev libinih-dev libmicrohttpd-dev libraw-dev libsystemd-dev libumockdev-dev libusb-1.0-0-dev libxxhash-dev \
-  gcc-avr avr-libc libsimavr-dev libelf-dev
+  gcc-avr avr-libc libsimavr-dev libelf-dev time
 PACKAGES_FUZZ := clang libclang-rt-dev
-PACKAGES_BENCH := libceres-dev g++ gnuplot-nox time
+PACKAGES_BENCH := libceres-dev g++ gnuplot-nox
 
 # ---- flags --------------------------------------------------------------------------------------------------------------
 FLAGS_release := -O2 -g

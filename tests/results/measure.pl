@@ -3,7 +3,7 @@
 #   measure.pl                the runs of targets.txt that are cheap: CHEAP_CPU_S processor seconds each, or less
 #   measure.pl all            all of them
 #   measure.pl S4 lag ...     what these targets, or these runs, need
-#   measure.pl read [RUN...]  nothing is run: the logs that are there are read again
+#   measure.pl read [RUN...]  nothing is run: the logs that are there are read again; what no log tells of stays
 #   measure.pl page           only README.md is written again
 # Run from the repository root, after make. What a command printed is kept in build/results/RUN.log. A figure comes into figures.csv from such
 # a log and in no other way; where a command fails or no figure is found in what it printed, the old row stays and says so. Targets
@@ -42,6 +42,7 @@ my (%run, %target, @runs, @targets);
     for (map { $target{$_} } @targets) {
         die "targets.txt: $_->{id}: no run $_->{run}\n" if $_->{run} && !$run{$_->{run}};
         die "targets.txt: $_->{id}: expected 'bound: <= 2.5', or >=, =\n" if $_->{bound} !~ /^(<=|>=|=) -?[\d.e+-]+$/;
+        die "targets.txt: $_->{id}: counts what run $_->{run} prints, which has no 'proof: /REGEX/' that it came to its end\n" if $_->{run} && $_->{parse} =~ /^count/ && !$run{$_->{run}}{proof};
         die "targets.txt: $_->{id}: expected 'parse: max|min|last|count /REGEX/'\n" if $_->{run} && $_->{parse} !~ m{^(max|min|last|count) /.+/$};
     }
 }
@@ -127,7 +128,8 @@ sub read_log {
     if (open(my $f, '<', "$logs/$r->{id}.log")) { local $/; $text = <$f> }
     for my $t (grep { ($_->{run} // '') eq $r->{id} } map { $target{$_} } @targets) {
         # A bench that finds a promise broken ends with 1 and has its figures all the same.
-        my $figure = defined $text && %m && $m{rc} <= ($r->{fails} // 0) ? figure($text, $t->{parse}) : undef;
+        my ($proof) = ($r->{proof} // '') =~ m{^/(.+)/$}; # that it came to its end: what is counted may well not be there
+        my $figure = defined $text && %m && $m{rc} <= ($r->{fails} // 0) && (!defined $proof || $text =~ /$proof/m) ? figure($text, $t->{parse}) : undef;
         my $text_of_target = "$t->{what}: $t->{bound}" . ($t->{unit} ? " $t->{unit}" : '');
         if (!defined $figure) {
             my $why = %m ? $m{rc} <= ($r->{fails} // 0) ? 'no such figure in what the command printed' : "exit status $m{rc}" : 'could not be built or started';
@@ -173,17 +175,18 @@ sub write_page {
     if (open(my $f, '<', '/proc/cpuinfo')) { local $/; my $t = <$f>; $model = $1 if $t =~ /^model name\s*: (.*)$/m; $isa = $t =~ /\bavx512f\b/ ? ', AVX-512' : '' }
     my $debian = -f '/etc/debian_version' ? 'Debian ' . said('cat /etc/debian_version') : 'no Debian';
     open(my $p, '>', "$here/README.md.part") or die "$here/README.md.part: $!\n";
-    my $n_runs = grep { !/^note of/ } grep { defined } map { $row{$_}{date} ? $row{$_}{note} : undef } @targets;
+    my $n_notes = grep { $row{$_}{note} =~ /^note of/ } @targets;
+    my $n_runs = @targets - $n_notes - ($count{'not measured'} // 0);
     print $p <<"";
 <!-- written by tests/results/measure.pl out of figures.csv and targets.txt: change those -->
 # Results
 Every target of the solver and of the rig, and what is measured. `make results` runs what is cheap, `RESULTS=all make results` everything, `RESULTS="S4 lag"` what is
 named; each figure comes out of what the command of its row printed, with its commit, and none is entered by hand ([figures.csv](figures.csv): also processor
 seconds, peak memory, seed and size; [targets.txt](targets.txt): targets, commands, reasons). Rows marked *note* are of earlier sessions' notes, by the commands
-and commits they name, and were **not repeated**. A commit with "-dirty" had changes to benches or this page that were not committed yet.
+and commits they name (a note says the session; the commit is the newest of that time), and were **not repeated**. A commit with "-dirty" had changes that were not committed yet.
 \nMachine of this page: @{[said('nproc')]} cores ($model$isa), $debian, shared with other jobs: wall times are noise, processor seconds (CPU s) count. No real camera, board or raw file was
 there: the rig is simulated, the board is its real image in simavr.
-\n**@{[$count{yes} // 0]} met, @{[$count{partly} // 0]} met in part, @{[$count{no} // 0]} missed, @{[$count{'not measured'} // 0]} not measured**; $n_runs of @{[scalar @targets]} figures are of runs that figures.csv records, the others of notes.
+\n**@{[$count{yes} // 0]} met, @{[$count{partly} // 0]} met in part, @{[$count{no} // 0]} missed, @{[$count{'not measured'} // 0]} not measured**, of @{[scalar @targets]}: $n_runs by runs that figures.csv records, $n_notes by notes.
 
     if (my @pages = grep { -f "$here/$_->[0]" } ['chart.png', 'seconds against error, solver and peers'], ['chart.csv', 'the same as numbers'], ['studios.csv', 'what the whole chain loses of each studio, stage by stage']) {
         print $p "\nBeside this page: ", join('; ', map { "[$_->[0]]($_->[0]): $_->[1]" } @pages), ".\n";
