@@ -157,7 +157,7 @@ sub fill_in {
         my %r = (id => $t->{id}, target => "$t->{what}: $t->{bound}" . ($t->{unit} ? " $t->{unit}" : ''), unit => $t->{unit} // '', figure => '', met => 'not measured', note => $failed);
         if ($t->{earlier}) {
             my ($figure, $date, $commit, $command, $note) = split /\s*\|\s*/, $t->{earlier}, 5;
-            %r = (%r, figure => $figure, met => met($t, $figure), date => $date, commit => $commit, command => $command,
+            %r = (%r, figure => $figure + 0, met => met($t, $figure), date => $date, commit => $commit, command => $command,
                 (map { ($_ => $t->{$_} // '') } qw(method seed size)), note => join '; ', grep { length } "note of $date, commit $commit, not repeated", $note // '', $t->{partly} // '', $failed);
         }
         $row{$t->{id}} = \%r;
