@@ -12,8 +12,9 @@ MACHINE := $(shell uname -m)
 
 # ---- packages (Debian 12; the same names in Debian 13) ----------------------------------------------------------------
 PACKAGES := gcc make pkg-config libopenexr-dev libembree-dev libassimp-dev libjansson-dev libtiff-dev libpng-dev libjpeg-dev libexpat1-dev liblapacke-dev libopenblas-dev libcmocka-dev perl help2man dcraw \
-  libgphoto2-dev libgpiod-dev libinih-dev libmicrohttpd-dev libraw-dev libsystemd-dev libumockdev-dev libusb-1.0-0-dev libxxhash-dev \
+  libgphoto2-dev libgpiod-dev libinih-dev libmicrohttpd-dev libraw-dev libsystemd-dev libumockdev-dev umockdev libusb-1.0-0-dev libxxhash-dev \
   gcc-avr avr-libc libsimavr-dev libelf-dev time
+PACKAGES_TEST := chromium gphoto2 libimage-exiftool-perl hugin-tools libsuitesparse-dev
 PACKAGES_FUZZ := clang libclang-rt-dev
 PACKAGES_BENCH := libceres-dev g++ gnuplot-nox
 
@@ -55,7 +56,7 @@ object = $(patsubst %.c,$(BUILD)/obj/%.o,$(1))
 ifneq ($(filter firmware test test-vm demo bench bench-develop bench-firmware bench-panorama bench-rig chart figure5 figures results stability experiments,$(MAKECMDGOALS)),)
 FIRST := deps # these install what is missing before the first file is compiled
 endif
-.PHONY: all firmware deps deps-fuzz deps-bench test test-vm demo bench bench-develop bench-firmware bench-panorama bench-rig chart figure5 figures results stability experiments fuzz check-includes man install clean help
+.PHONY: all firmware deps deps-test deps-fuzz deps-bench test test-vm demo bench bench-develop bench-firmware bench-panorama bench-rig chart figure5 figures results stability experiments fuzz check-includes man install clean help
 .DELETE_ON_ERROR:
 .SECONDARY:
 
@@ -168,14 +169,15 @@ install_packages = @missing=$$(for p in $(1); do dpkg-query -W -f='$${Status}\n'
     $$SUDO apt-get update -qq && DEBIAN_FRONTEND=noninteractive $$SUDO apt-get install -y -qq --no-install-recommends $$missing >/dev/null || \
       { echo "deps: apt-get failed: run it by hand to see why: apt-get install" $$missing >&2; exit 1; }; echo "deps: done"; fi
 deps: ; $(call install_packages,$(PACKAGES))
+deps-test: deps ; $(call install_packages,$(PACKAGES_TEST))
 deps-fuzz: ; $(call install_packages,$(PACKAGES_FUZZ))
 deps-bench: deps ; $(call install_packages,$(PACKAGES_BENCH))
 
 # ---- tests ----------------------------------------------------------------------------------------------------------------
 TEST_PROGRAMS := $(addprefix $(BUILD)/tests/,$(TESTS))
 TEST_SCRIPTS := $(wildcard tests/check_*.sh tests/test_*.sh)
-test: deps all $(TEST_PROGRAMS) $(BUILD)/tests/board/boardsim
-	@CMOCKA_MESSAGE_OUTPUT=TAP BIN=$(BUILD)/bin prove -j $(shell nproc) --timer --merge --exec '' $(TEST_PROGRAMS) $(TEST_SCRIPTS)
+test: deps-test all $(TEST_PROGRAMS) $(BUILD)/tests/board/boardsim
+	@CMOCKA_MESSAGE_OUTPUT=TAP BIN=$(BUILD)/bin prove -j $(shell nproc) --timer --merge --failures --comments --exec '' $(TEST_PROGRAMS) $(TEST_SCRIPTS)
 test-vm: deps $(BUILD)/tests/vm/test_gpio_vm
 	@prove --timer --verbose --exec '' tests/vm/run.sh :: $(BUILD)/vm $(BUILD)/tests/vm/test_gpio_vm
 check-includes:

@@ -1,6 +1,7 @@
 // tests/test_camera_worker.c - the real worker with the real libgphoto2 against simulated cameras: what it promises in camera.h.
 #include "rigd/camera.h"
 #include "rigd/digest.h"
+#include "tests/loopback.h"
 #include "tests/scratch.h"
 
 #include <errno.h>
@@ -49,47 +50,41 @@ static void sim_stop(struct sim *s)
 // Up when it returns. faults: a script, or NULL.
 static void sims_start(struct sim *s, int n_cameras, const char *personality, const char *faults)
 {
-    static int port;
-    if (!port)
-        port = 20000 + getpid() % 3000 * 4; // below those that the system gives away
-    for (int tries = 0; tries < 50; tries++) {
-        int pipes[2];
-        char number[16], cameras[16], kind[64], script[900], line[256];
-        port = port > 32000 ? 20000 : port + 2 * n_cameras;
-        snprintf(number, sizeof(number), "-p%d", port);
-        snprintf(cameras, sizeof(cameras), "-n%d", n_cameras);
-        snprintf(kind, sizeof(kind), "--personality=%s", personality);
-        snprintf(script, sizeof(script), "--faults=%s", scratch_path("faults"));
-        if (faults)
-            scratch_write("faults", faults, strlen(faults));
-        assert_int_equal(pipe2(pipes, O_CLOEXEC), 0);
-        s->pid = fork();
-        assert_true(s->pid >= 0);
-        if (!s->pid) {
-            prctl(PR_SET_PDEATHSIG, SIGKILL);
-            dup2(pipes[1], 2);
-            execl(bin("rigsim"), "rigsim", cameras, number, kind, "--raw-size=1224x816", faults ? script : NULL, NULL);
-            _exit(127);
-        }
-        close(pipes[1]);
-        ssize_t n = 0, got;
-        while (n < (ssize_t)sizeof(line) - 1 && !memchr(line, '\n', (size_t)n) &&
-               (got = read(pipes[0], line + n, sizeof(line) - 1 - (size_t)n)) > 0)
-            n += got;
-        line[n] = 0;
-        s->log = pipes[0];
-        if (strstr(line, "info: server: ")) {
-            s->first_port = port;
-            snprintf(s->port, sizeof(s->port), "ptpip:127.0.0.1:%d:%d", port, port + 1);
-            if (faults)
-                unlink(scratch_path("faults"));
-            return;
-        }
-        sim_stop(s);
-        if (!strstr(line, "use"))
-            fail_msg("rigsim does not start: %s", line);
+    static int port = 15740; // rigs of one test have different ones
+    int pipes[2];
+    char address[32], number[16], cameras[16], kind[64], script[900], line[256];
+    snprintf(address, sizeof(address), "--address=%s", loopback_address());
+    snprintf(number, sizeof(number), "-p%d", port);
+    snprintf(cameras, sizeof(cameras), "-n%d", n_cameras);
+    snprintf(kind, sizeof(kind), "--personality=%s", personality);
+    snprintf(script, sizeof(script), "--faults=%s", scratch_path("faults"));
+    if (faults)
+        scratch_write("faults", faults, strlen(faults));
+    assert_int_equal(pipe2(pipes, O_CLOEXEC), 0);
+    s->pid = fork();
+    assert_true(s->pid >= 0);
+    if (!s->pid) {
+        prctl(PR_SET_PDEATHSIG, SIGKILL);
+        dup2(pipes[1], 2);
+        execl(bin("rigsim"), "rigsim", address, cameras, number, kind, "--raw-size=1224x816", faults ? script : NULL, NULL);
+        _exit(127);
     }
-    fail_msg("no free port for rigsim");
+    close(pipes[1]);
+    ssize_t n = 0, got;
+    while (n < (ssize_t)sizeof(line) - 1 && !memchr(line, '\n', (size_t)n) &&
+           (got = read(pipes[0], line + n, sizeof(line) - 1 - (size_t)n)) > 0)
+        n += got;
+    line[n] = 0;
+    s->log = pipes[0];
+    s->first_port = port;
+    port += 2 * n_cameras;
+    snprintf(s->port, sizeof(s->port), "ptpip:%s:%d:%d", loopback_address(), s->first_port, s->first_port + 1);
+    if (faults)
+        unlink(scratch_path("faults"));
+    if (strstr(line, "info: server: "))
+        return;
+    sim_stop(s);
+    fail_msg("rigsim does not start: %s", line);
 }
 
 static void sim_start(struct sim *s, const char *personality, const char *faults)
@@ -698,7 +693,7 @@ static void hostile_replies_are_survived_or_kill_only_the_worker(void **state)
                 { .kind = CAMERA_COLLECT, .n_objects = 1, .timeout_ms = 300 }, plain(CAMERA_LIST),
                 fetching(CAMERA_THUMBNAIL, &object, name), fetching(CAMERA_FETCH, &object, name),
             };
-            snprintf(c[0].port, sizeof(c[0].port), "ptpip:127.0.0.1:%d:%d", s.first_port + 2 * i, s.first_port + 2 * i + 1);
+            snprintf(c[0].port, sizeof(c[0].port), "ptpip:%s:%d:%d", loopback_address(), s.first_port + 2 * i, s.first_port + 2 * i + 1);
             if (alive[i])
                 worker_send(&w[i], &c[step]);
         }

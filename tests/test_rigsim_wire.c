@@ -1,8 +1,9 @@
 // tests/test_rigsim_wire.c - the whole simulated rig over its sockets: many cameras at once, shutter lines, every fault.
 //
-// Starts build/bin/rigsim ($BIN/rigsim) on free ports.
+// Starts build/bin/rigsim ($BIN/rigsim) on a loopback address of its own.
 #include "tests/rigsim/client.h"
 #include "rigd/shutter_line.h"
+#include "tests/loopback.h"
 #include "tests/scratch.h"
 
 #include <arpa/inet.h>
@@ -21,10 +22,9 @@
 #define ASK(c, code, ...) \
     client_ask(c, code, (int)(sizeof((uint32_t[]){ __VA_ARGS__ }) / 4), (uint32_t[]){ __VA_ARGS__ }, NULL, 0)
 enum { OK = 0x2001, BUSY = 0x2019, GET_OBJECT = 0x1009, GET_HANDLES = 0x1007, CAPTURE = 0x100e, GET_PROPERTY = 0x1015,
-       FOLDER = 0x00010002, PATIENCE_MS = 20000 };
+       FOLDER = 0x00010002, PATIENCE_MS = 20000, PORT = 15740 };
 
 static pid_t rigsim;
-static int port;
 
 static int64_t now_ns(void)
 {
@@ -38,36 +38,15 @@ static void sleep_ms(int ms)
     nanosleep(&(struct timespec){ ms / 1000, ms % 1000 * 1000000L }, NULL);
 }
 
-// Below the range that the kernel gives to others; n ports that can be bound now.
-static int free_ports(int n)
-{
-    for (int first = 20000 + (int)getpid() % 5000 * 2; first + n < 32000; first += n) {
-        int ok = 1;
-        for (int i = 0; ok && i < n; i++) {
-            const struct sockaddr_in a = { .sin_family = AF_INET, .sin_port = htons((uint16_t)(first + i)),
-                                           .sin_addr.s_addr = htonl(INADDR_LOOPBACK) };
-            const int fd = socket(AF_INET, SOCK_STREAM, 0), on = 1;
-            setsockopt(fd, SOL_SOCKET, SO_REUSEADDR, &on, sizeof(on));
-            ok = !bind(fd, (const struct sockaddr *)&a, sizeof(a));
-            close(fd);
-        }
-        if (ok)
-            return first;
-    }
-    return -1;
-}
-
-// options: up to 16 words after "--cameras N --port P"; faults: a script's text, or NULL.
+// options: up to 16 words after "--cameras N --address A"; faults: a script's text, or NULL.
 static void start(int n_cameras, const char *faults, const char *const *options)
 {
-    char bin[512], cameras[16], first[16], script[600];
-    const char *argv[32] = { bin, "--cameras", cameras, "--port", first };
+    char bin[512], cameras[16], script[600], log[600];
+    const char *argv[32] = { bin, "--cameras", cameras, "--address", loopback_address() };
     int n = 5;
-    port = free_ports(2 * n_cameras);
-    assert_true(port > 0);
     snprintf(bin, sizeof(bin), "%s/rigsim", getenv("BIN") ? getenv("BIN") : "build/bin");
     snprintf(cameras, sizeof(cameras), "%d", n_cameras);
-    snprintf(first, sizeof(first), "%d", port);
+    snprintf(log, sizeof(log), "%s/rigsim.log", scratch_dir);
     if (faults) {
         scratch_write("faults", faults, strlen(faults));
         snprintf(script, sizeof(script), "%s/faults", scratch_dir);
@@ -78,25 +57,32 @@ static void start(int n_cameras, const char *faults, const char *const *options)
         argv[n++] = options[i];
     argv[n] = NULL;
     if (rigsim > 0) // a test failed before its stop()
-        kill(rigsim, SIGKILL);
+        kill(rigsim, SIGKILL), waitpid(rigsim, NULL, 0);
     rigsim = fork();
     if (rigsim == 0) {
         prctl(PR_SET_PDEATHSIG, SIGKILL);
         if (!getenv("RIGSIM_VERBOSE"))
-            freopen("/dev/null", "w", stderr);
+            freopen(log, "w", stderr);
         execv(bin, (char *const *)(uintptr_t)argv);
         _exit(127);
     }
     for (int i = 0; i < 400; i++) { // until the last camera listens
         struct client c;
-        if (!client_open(&c, port + 2 * (n_cameras - 1), PATIENCE_MS)) {
+        if (!client_open(&c, loopback_address(), PORT + 2 * (n_cameras - 1), PATIENCE_MS)) {
             client_close(&c);
             return;
         }
-        assert_int_equal(waitpid(rigsim, NULL, WNOHANG), 0);
+        if (waitpid(rigsim, NULL, WNOHANG)) {
+            rigsim = 0;
+            break;
+        }
         sleep_ms(10);
     }
-    fail_msg("rigsim does not listen");
+    char line[300] = "nothing";
+    FILE *f = fopen(log, "r");
+    if (f && fgets(line, sizeof(line), f))
+        fclose(f);
+    fail_msg("rigsim does not listen; it says: %s", line);
 }
 
 // It must end by itself when told to, with success: under ASan this finds leaks.
@@ -151,7 +137,7 @@ static void *download_one(void *arg)
 {
     struct download *d = arg;
     struct client c;
-    d->err = client_open(&c, port + 2 * d->camera, PATIENCE_MS);
+    d->err = client_open(&c, loopback_address(), PORT + 2 * d->camera, PATIENCE_MS);
     if (d->err)
         return NULL;
     d->err = ASK(&c, CAPTURE, 0, 0);
@@ -223,7 +209,7 @@ static void many_clients_one_after_another_leave_nothing_behind(void **state)
     const int before = open_files(0);
     for (int i = 0; i < 300; i++) {
         struct client c;
-        assert_int_equal(client_open(&c, port, PATIENCE_MS), 0);
+        assert_int_equal(client_open(&c, loopback_address(), PORT, PATIENCE_MS), 0);
         assert_int_equal(ASK(&c, GET_PROPERTY, 0x5001), OK);
         client_close(&c);
     }
@@ -236,11 +222,11 @@ static void a_second_client_is_refused_while_the_first_is_there(void **state)
     (void)state;
     struct client a, b;
     start(1, NULL, NULL);
-    assert_int_equal(client_open(&a, port, PATIENCE_MS), 0);
-    assert_int_equal(client_open(&b, port, PATIENCE_MS), -EPROTO); // INIT_FAIL
+    assert_int_equal(client_open(&a, loopback_address(), PORT, PATIENCE_MS), 0);
+    assert_int_equal(client_open(&b, loopback_address(), PORT, PATIENCE_MS), -EPROTO); // INIT_FAIL
     assert_int_equal(ASK(&a, GET_PROPERTY, 0x5001), OK);
     client_close(&a);
-    assert_int_equal(client_open(&b, port, PATIENCE_MS), 0); // and at once afterwards
+    assert_int_equal(client_open(&b, loopback_address(), PORT, PATIENCE_MS), 0); // and at once afterwards
     client_close(&b);
     stop();
 }
@@ -250,10 +236,10 @@ static void noise_on_a_socket_ends_that_socket_only(void **state)
     (void)state;
     struct client c;
     start(2, NULL, NULL);
-    assert_int_equal(client_open(&c, port + 2, PATIENCE_MS), 0);
+    assert_int_equal(client_open(&c, loopback_address(), PORT + 2, PATIENCE_MS), 0);
     for (unsigned k = 0; k < 200; k++) {
-        const struct sockaddr_in a = { .sin_family = AF_INET, .sin_port = htons((uint16_t)(port + (int)(k % 4))),
-                                       .sin_addr.s_addr = htonl(INADDR_LOOPBACK) };
+        const struct sockaddr_in a = { .sin_family = AF_INET, .sin_port = htons((uint16_t)(PORT + (int)(k % 4))),
+                                       .sin_addr.s_addr = inet_addr(loopback_address()) };
         uint8_t bytes[512];
         uint32_t x = k * 2654435761u + 1;
         for (size_t i = 0; i < sizeof(bytes); i++) {
@@ -386,7 +372,7 @@ static void a_pressed_body_is_silent_until_its_host_dies(void **state)
     struct client c;
     snprintf(path, sizeof(path), "%s/lines", scratch_dir);
     start(1, NULL, (const char *[]){ "--raw-size", "64x48", "--trigger-socket", path, NULL });
-    assert_int_equal(client_open(&c, port, 300), 0);
+    assert_int_equal(client_open(&c, loopback_address(), PORT, 300), 0);
     const int fd = lines_open(path);
     set_line(fd, SHUTTER_LINE_HALF, 1, 0, 0, 0);
     sleep_ms(100);
@@ -406,7 +392,7 @@ static void a_cut_supply_breaks_the_link_and_spares_the_card(void **state)
     struct client c;
     snprintf(path, sizeof(path), "%s/lines", scratch_dir);
     start(1, NULL, (const char *[]){ "--raw-size", "64x48", "--trigger-socket", path, NULL });
-    assert_int_equal(client_open(&c, port, PATIENCE_MS), 0);
+    assert_int_equal(client_open(&c, loopback_address(), PORT, PATIENCE_MS), 0);
     assert_int_equal(ASK(&c, CAPTURE, 0, 0), OK);
     const uint32_t handle = file(&c, 0);
     const int fd = lines_open(path);
@@ -416,10 +402,10 @@ static void a_cut_supply_breaks_the_link_and_spares_the_card(void **state)
         err = ASK(&c, GET_PROPERTY, 0x5001);
     assert_int_equal(err, -EPIPE);
     client_close(&c);
-    assert_int_equal(client_open(&c, port, PATIENCE_MS), -ECONNREFUSED);
+    assert_int_equal(client_open(&c, loopback_address(), PORT, PATIENCE_MS), -ECONNREFUSED);
     set_line(fd, SHUTTER_LINE_POWER, 0, 0, 0, 0);
     for (int64_t end = now_ns() + PATIENCE_MS * MS; err && now_ns() < end; sleep_ms(20))
-        err = client_open(&c, port, PATIENCE_MS);
+        err = client_open(&c, loopback_address(), PORT, PATIENCE_MS);
     assert_int_equal(err, 0);
     assert_int_equal(file(&c, 0), handle);
     client_close(&c);
@@ -445,7 +431,7 @@ static void faults_strike_their_camera_and_no_other(void **state)
     uint32_t value;
     start(9, script, (const char *[]){ "--raw-size", "128x96", "--clock", "fixed", NULL });
     for (int i = 0; i < 9; i++)
-        assert_int_equal(client_open(&c[i], port + 2 * i, PATIENCE_MS), 0);
+        assert_int_equal(client_open(&c[i], loopback_address(), PORT + 2 * i, PATIENCE_MS), 0);
     // busy, for its time
     int64_t from = now_ns();
     assert_int_equal(ASK(&c[0], CAPTURE, 0, 0), BUSY);
@@ -465,9 +451,9 @@ static void faults_strike_their_camera_and_no_other(void **state)
     // refused, then back
     assert_int_equal(ASK(&c[2], GET_PROPERTY, 0x5001), -EPIPE);
     client_close(&c[2]);
-    assert_int_equal(client_open(&c[2], port + 4, PATIENCE_MS), -ECONNREFUSED);
+    assert_int_equal(client_open(&c[2], loopback_address(), PORT + 4, PATIENCE_MS), -ECONNREFUSED);
     wait_until(now_ns() + 450 * MS);
-    assert_int_equal(client_open(&c[2], port + 4, PATIENCE_MS), 0);
+    assert_int_equal(client_open(&c[2], loopback_address(), PORT + 4, PATIENCE_MS), 0);
     // the event is lost, the file is not
     assert_int_equal(ASK(&c[3], CAPTURE, 0, 0), OK);
     assert_int_equal(client_event(&c[3], &code, &value), 0);
@@ -506,14 +492,14 @@ static void hostile_replies_never_hang_a_careful_client(void **state)
     start(10, script, NULL);
     for (int i = 0; i < 10; i++) {
         struct client c;
-        assert_int_equal(client_open(&c, port + 2 * i, 500), 0);
+        assert_int_equal(client_open(&c, loopback_address(), PORT + 2 * i, 500), 0);
         const int got = ASK(&c, 0x1005, 0x00010001);
         if (i == 3 || i == 4 || i == 8)
             assert_int_equal(got, OK); // a sound packet with wrong content
         else
             assert_true(got == -EPROTO || got == -ETIMEDOUT || got == -EPIPE);
         client_close(&c);
-        assert_int_equal(client_open(&c, port + 2 * i, PATIENCE_MS), 0); // and the camera is well again
+        assert_int_equal(client_open(&c, loopback_address(), PORT + 2 * i, PATIENCE_MS), 0); // and the camera is well again
         assert_int_equal(ASK(&c, 0x1005, 0x00010001), OK);
         assert_int_equal(c.data.n, 26 + 1 + 1 + 2 * 8); // no description, volume SIMCARD
         client_close(&c);
@@ -529,7 +515,7 @@ static void a_flood_of_events_drowns_no_answer(void **state)
     uint32_t value;
     int n = 0;
     start(1, "A01 on op 0x100e#1 flood 2000 500ms\n", (const char *[]){ "--raw-size", "64x48", NULL });
-    assert_int_equal(client_open(&c, port, PATIENCE_MS), 0);
+    assert_int_equal(client_open(&c, loopback_address(), PORT, PATIENCE_MS), 0);
     assert_int_equal(ASK(&c, CAPTURE, 0, 0), OK);
     assert_true(file(&c, 0) != 0);
     c.timeout_ms = 300;

@@ -16,7 +16,6 @@ my ($n_cameras, $n_takes) = (shift // 6, shift // 20);
 my $rig = Rig->new($n_cameras);
 $rig->start;
 my $page;
-for (1 .. 100) { last if IO::Socket::INET->new(PeerAddr => '127.0.0.1', PeerPort => $rig->{port}); sleep .05 }
 sub load { # of rigd, while nothing happens but heartbeats
     my ($cpu, $began) = (processor_s(), time);
     sleep 26; # a heartbeat at least

@@ -1,25 +1,51 @@
-# tests/browser/Rig.pm - rigsim's cameras and a rigd with a page, in a folder of their own.
+# tests/browser/Rig.pm - rigsim's cameras and a rigd with a page, in a folder and on a loopback address of their own.
 package Rig;
 use strict;
 use warnings;
 use Cwd ();
 use File::Temp ();
 use IO::Socket::INET;
+use POSIX ();
 use Time::HiRes qw(time sleep);
 
 sub new {
     my ($class, $n_cameras) = @_;
     my $bin = $ENV{BIN} // 'build/bin';
     my $dir = File::Temp::tempdir('studiorig-test-XXXXXX', TMPDIR => 1, CLEANUP => 1);
-    my $listener = IO::Socket::INET->new(Listen => 1, LocalAddr => '127.0.0.1') or die "no free port: $!";
-    my $self = bless { bin => $bin, dir => $dir, n => $n_cameras, port => $listener->sockport, wires => "$dir/w" }, $class;
-    close $listener;
-    my $first = $n_cameras < 10 ? 20000 + $$ % 2000 * 20 : 10000 + $$ % 20 * 450; # as tests/test_rig_chain.sh; or out of its way
-    my @sim = ("$bin/rigsim", '--cameras', $n_cameras, qw(--personality nikon --seed 1 --raw-size 408x272 --port), $first, '--trigger-socket', $self->{wires});
+    # whoever runs at the same time has another (tests/loopback.h)
+    my $address = sprintf '127.%d.%d.%d', 1 + ($$ >> 16 & 127), $$ >> 8 & 255, $$ & 255;
+    my $self = bless { bin => $bin, dir => $dir, n => $n_cameras, address => $address, port => 8420, wires => "$dir/w" }, $class;
+    my @sim = ("$bin/rigsim", '--cameras', $n_cameras, '--address', $address, qw(--personality nikon --seed 1 --raw-size 408x272 --trigger-socket), $self->{wires});
     $self->{list} = `@sim --list`;
     $self->{sim} = run("$dir/sim.log", @sim);
-    for (1 .. 100) { last if -S $self->{wires}; sleep .05 }
+    $self->up('sim', sub { -S $self->{wires} });
     return $self;
+}
+
+# Waits until it is there. A program that has ended ends this one, too, with what it said.
+sub up {
+    my ($self, $which, $is_there) = @_;
+    my $program = { sim => 'rigsim', rigd => 'rigd' }->{$which};
+    for (my $end = time + 20; time < $end; sleep .05) {
+        return if $is_there->();
+        if (waitpid($self->{$which}, POSIX::WNOHANG)) {
+            delete $self->{$which};
+            die "# $program has ended\n", $self->logs;
+        }
+    }
+    die "# $program is not there after 20 s\n", $self->logs;
+}
+
+# The end of what both said, as comments of TAP.
+sub logs {
+    my ($self) = @_;
+    my $text = '';
+    for my $name (qw(sim rigd)) {
+        open my $f, '<', "$self->{dir}/$name.log" or next;
+        my @lines = <$f>;
+        $text .= "# $name.log: $_" for @lines > 15 ? @lines[-15 .. -1] : @lines;
+    }
+    return $text;
 }
 
 sub run {
@@ -31,7 +57,7 @@ sub run {
     exec @command or die "$command[0]: $!";
 }
 
-sub url { "http://127.0.0.1:$_[0]{port}/" }
+sub url { "http://$_[0]{address}:$_[0]{port}/" }
 
 sub start { # wires: where its trigger is looked for
     my ($self, $wires) = @_;
@@ -39,9 +65,10 @@ sub start { # wires: where its trigger is looked for
     $list =~ s/^address = .*/address = $wires/m if $wires;
     open my $f, '>', "$dir/rigd.conf" or die $!;
     print $f "[rig]\nname = studio <b>one</b>\ntakes = $dir/takes\nstate = $dir/state\nsocket = $dir/s\npersonality_dir = ", Cwd::getcwd(), "/config/cameras\nraw_mb = 2\nfree_space_mb = 1\n",
-        "[web]\nlisten = 127.0.0.1:$self->{port}\n[settings]\niso = 100\nshutter = 1/125\n", $list;
+        "[web]\nlisten = $self->{address}:$self->{port}\n[settings]\niso = 100\nshutter = 1/125\n", $list;
     close $f;
     $self->{rigd} = run("$dir/rigd.log", "$self->{bin}/rigd", '--config', "$dir/rigd.conf");
+    $self->up('rigd', sub { IO::Socket::INET->new(PeerAddr => $self->{address}, PeerPort => $self->{port}) });
 }
 
 sub stop { # how long it took, in seconds
@@ -57,6 +84,7 @@ sub DESTROY {
     my ($self) = @_;
     local $?;
     $self->stop;
+    return unless $self->{sim};
     kill 'TERM', $self->{sim};
     waitpid $self->{sim}, 0;
 }

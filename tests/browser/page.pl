@@ -10,7 +10,7 @@ use Time::HiRes qw(sleep);
 plan skip_all => 'no chromium here (apt-get install chromium)' unless Browser::find();
 my $rig = Rig->new(6);
 $rig->start;
-for (1 .. 100) { last if IO::Socket::INET->new(PeerAddr => '127.0.0.1', PeerPort => $rig->{port}); sleep .05 }
+END { if ($rig && !Test::More->builder->is_passing) { local $?; print STDERR $rig->logs } }
 my $profile = File::Temp::tempdir(CLEANUP => 1);
 my $page = Browser->open($rig->url, $profile);
 my $text = sub { $page->js("document.querySelector('$_[0]').textContent") };
@@ -18,7 +18,7 @@ my $is_off = sub { $page->js("document.querySelector('$_[0]').disabled") };
 my $picture = sub { return unless $ENV{PICTURES}; $page->size(@_[1, 2]); $page->picture("$ENV{PICTURES}/$_[0].png") };
 $page->size(1400, 900);
 
-ok $page->until_true('document.querySelectorAll("#cameras li.ready").length === 6'), 'the grid shows six cameras, ready';
+ok $page->until_true('document.querySelectorAll("#cameras li.ready").length === 6', 60), 'the grid shows six cameras, ready' or do { done_testing; exit 1 }; # nothing below can hold
 is $text->('#rig'), 'studio <b>one</b>', 'what rigd says is text, never markup';
 like $text->('#cameras li'), qr/A01.*ready.*battery 100 %.*free.*D500/, 'a camera: name, condition in a word, battery, free images, body';
 ok $page->until_true('!document.querySelector("#capture").disabled'), 'the button is armed';

@@ -18,10 +18,10 @@ static int64_t now_ms(void)
     return (int64_t)t.tv_sec * 1000 + t.tv_nsec / 1000000;
 }
 
-static int connect_to(int port)
+static int connect_to(const char *address, int port)
 {
     const struct sockaddr_in a = { .sin_family = AF_INET, .sin_port = htons((uint16_t)port),
-                                   .sin_addr.s_addr = htonl(INADDR_LOOPBACK) };
+                                   .sin_addr.s_addr = inet_addr(address) };
     const int fd = socket(AF_INET, SOCK_STREAM | SOCK_CLOEXEC, 0);
     if (fd < 0 || connect(fd, (const struct sockaddr *)&a, sizeof(a))) {
         const int err = -errno;
@@ -86,18 +86,18 @@ static int exchange(struct client *c, int fd, struct dataset *in, const struct p
     return err ? err : got->type == wanted ? 0 : -EPROTO;
 }
 
-int client_open(struct client *c, int port, int timeout_ms)
+int client_open(struct client *c, const char *address, int port, int timeout_ms)
 {
     struct ptpip_packet got;
     *c = (struct client){ .command = -1, .event = -1, .timeout_ms = timeout_ms };
-    int err = c->command = connect_to(port);
+    int err = c->command = connect_to(address, port);
     if (err < 0)
         goto fail;
     const struct ptpip_packet hello = { .type = PTPIP_INIT_COMMAND_REQUEST, .name = "test", .version = 0x10000 };
     err = exchange(c, c->command, &c->in, &hello, PTPIP_INIT_COMMAND_ACK, &got);
     if (err)
         goto fail;
-    err = c->event = connect_to(port + 1);
+    err = c->event = connect_to(address, port + 1);
     if (err < 0)
         goto fail;
     const struct ptpip_packet events = { .type = PTPIP_INIT_EVENT_REQUEST, .connection = got.connection };

@@ -15,8 +15,8 @@ struct client {
     uint32_t param[PTPIP_PARAMS_MAX];
 };
 
-// Both connections to 127.0.0.1:port, port + 1 and a session. 0, -ECONNREFUSED, -ETIMEDOUT, -EPROTO, -EPIPE.
-int client_open(struct client *c, int port, int timeout_ms);
+// Both connections to address (dotted), port and port + 1, and a session. 0, -ECONNREFUSED, -ETIMEDOUT, -EPROTO, -EPIPE.
+int client_open(struct client *c, const char *address, int port, int timeout_ms);
 void client_close(struct client *c);
 // One transaction; data: what the camera is sent, or NULL. The response code; negative: -ETIMEDOUT (no answer in time), -EPIPE (link
 // broken), -EPROTO (no PTP/IP, another transaction's answer, or another length than announced).

@@ -5,6 +5,7 @@
 #include "tests/rigsim/server.h"
 
 #include <argp.h>
+#include <arpa/inet.h>
 #include <errno.h>
 #include <math.h>
 #include <stdio.h>
@@ -14,16 +15,17 @@
 const char *argp_program_version = "rigsim (studiorig) " STUDIORIG_VERSION;
 static const char doc[] =
     "Simulated cameras of a studio over PTP/IP, for libgphoto2 and rigd, without hardware or root.\v"
-    "Camera i listens on 127.0.0.1:PORT+2i (commands) and PORT+2i+1 (events). First steps:\n"
+    "Camera i listens on ADDRESS:PORT+2i (commands) and PORT+2i+1 (events); ADDRESS is 127.0.0.1 unless --address says otherwise. First steps:\n"
     "  rigsim --cameras 3 &\n"
     "  gphoto2 --port ptpip:127.0.0.1:15740:15741 --summary\n"
     "  gphoto2 --port ptpip:127.0.0.1:15740:15741 --capture-image-and-download\n"
     "tests/rigsim/README.md says what is simulated, and how to script faults.";
 
 enum { OPTION_RAW_SIZE = 256, OPTION_SEED, OPTION_FAULTS, OPTION_LIST, OPTION_TRIGGER, OPTION_CLOCK, OPTION_SET, OPTION_PERSONALITY,
-       OPTION_SCENE, OPTION_PANORAMA, OPTION_PANORAMA_CAMERA, OPTION_PANORAMA_GAIN, OPTION_LENS };
+       OPTION_SCENE, OPTION_PANORAMA, OPTION_PANORAMA_CAMERA, OPTION_PANORAMA_GAIN, OPTION_LENS, OPTION_ADDRESS };
 static const struct argp_option options[] = {
     { "cameras", 'n', "N", 0, "how many, 1 .. 500 (default 1)", 0 },
+    { "address", OPTION_ADDRESS, "A", 0, "of this machine only: 127.x.y.z (default 127.0.0.1); rigs with an address each cannot get in each other's way", 0 },
     { "port", 'p', "P", 0, "first port (default 15740)", 0 },
     { "personality", OPTION_PERSONALITY, "NAME|FILE", 0, "generic (default), nikon, canon, or a file (tests/rigsim/personality.h)", 0 },
     { "set", OPTION_SET, "KEY=VALUE", 0, "change one statement of the personality, e.g. lag_jitter_ms=3", 0 },
@@ -71,6 +73,13 @@ static error_t option(int key, char *text, struct argp_state *state)
     case 'p':
         a->server.port = (int)number(state, "--port", text, 1, 65534);
         return 0;
+    case OPTION_ADDRESS: {
+        struct in_addr in;
+        if (inet_pton(AF_INET, text, &in) != 1 || ntohl(in.s_addr) >> 24 != 127)
+            argp_error(state, "--address: found '%s'; expected 127.x.y.z: nobody else is to reach simulated cameras", text);
+        a->server.address = text;
+        return 0;
+    }
     case OPTION_PERSONALITY:
         a->personality = text;
         return 0;
@@ -166,8 +175,8 @@ static void print_list(const struct server_settings *s)
         struct body b;
         if (body_init(&b, s->personality, i, s->seed, 0, 0))
             return;
-        printf("[camera \"%s\"]\nserial = %s\nport = ptpip:127.0.0.1:%u:%u\npersonality = %s\n", server_camera_name(i), b.serial,
-               (unsigned)s->port + 2 * i, (unsigned)s->port + 2 * i + 1, rigd_personality[s->personality->vendor]);
+        printf("[camera \"%s\"]\nserial = %s\nport = ptpip:%s:%u:%u\npersonality = %s\n", server_camera_name(i), b.serial,
+               s->address, (unsigned)s->port + 2 * i, (unsigned)s->port + 2 * i + 1, rigd_personality[s->personality->vendor]);
         if (s->trigger_socket)
             printf("full_line = %u\nhalf_line = %u\nfeedback_line = %u\nrelay_line = %u\n", i, i, i, i);
         printf("\n");
@@ -179,7 +188,7 @@ static void print_list(const struct server_settings *s)
 
 int main(int argc, char **argv)
 {
-    struct arguments a = { .server = { .n_cameras = 1, .port = 15740, .width_px = 2448, .height_px = 1632, .panorama_gain = 1 },
+    struct arguments a = { .server = { .n_cameras = 1, .address = "127.0.0.1", .port = 15740, .width_px = 2448, .height_px = 1632, .panorama_gain = 1 },
                            .personality = "generic", .panorama_camera = -1 };
     const struct argp parser = { options, option, NULL, doc, NULL, NULL, NULL };
     struct personality *p = malloc(sizeof(*p));

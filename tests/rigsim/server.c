@@ -369,13 +369,13 @@ int server_listen(struct camera *c)
             continue;
         const int port = s->port + 2 * (int)c->index + (int)k, on = 1;
         const struct sockaddr_in a = { .sin_family = AF_INET, .sin_port = htons((uint16_t)port),
-                                       .sin_addr.s_addr = htonl(INADDR_LOOPBACK) };
+                                       .sin_addr.s_addr = inet_addr(s->address) };
         const int fd = socket(AF_INET, SOCK_STREAM | SOCK_NONBLOCK | SOCK_CLOEXEC, 0);
         if (fd < 0 || setsockopt(fd, SOL_SOCKET, SO_REUSEADDR, &on, sizeof(on)) ||
             bind(fd, (const struct sockaddr *)&a, sizeof(a)) || listen(fd, 64)) {
             const int err = -errno;
-            log_error("rigsim: 127.0.0.1:%d for camera %s: %s; choose another --port", port, server_camera_name(c->index),
-                      strerror(-err));
+            log_error("rigsim: %s:%d for camera %s: %s; choose another --address or --port", s->address, port,
+                      server_camera_name(c->index), strerror(-err));
             if (fd >= 0)
                 close(fd);
             return err;
@@ -613,8 +613,8 @@ int server_run(const struct server_settings *settings)
         s.client[i].fd = -1;
     const int err = open_server(&s);
     if (!err)
-        log_info("server: %u cameras (%s %s) on 127.0.0.1:%d..%d", settings->n_cameras, settings->personality->manufacturer,
-                 settings->personality->model, settings->port, settings->port + 2 * (int)settings->n_cameras - 1);
+        log_info("server: %u cameras (%s %s) on %s:%d..%d", settings->n_cameras, settings->personality->manufacturer,
+                 settings->personality->model, settings->address, settings->port, settings->port + 2 * (int)settings->n_cameras - 1);
     for (bool go_on = !err; go_on;) {
         struct epoll_event event[64];
         set_timer(&s);

@@ -10,7 +10,8 @@ enum { SERVER_CAMERAS_MAX = 500 };
 
 struct server_settings {
     unsigned n_cameras;
-    int port;                // camera i: port + 2 i (command), port + 2 i + 1 (events), on 127.0.0.1
+    const char *address;     // dotted, in 127.0.0.0/8
+    int port;                // camera i: port + 2 i (command), port + 2 i + 1 (events)
     const char *scene;       // folder, or NULL
     int width_px, height_px; // of raws
     uint64_t seed;
