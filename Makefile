@@ -13,7 +13,7 @@ MACHINE := $(shell uname -m)
 # ---- packages (Debian 12; the same names in Debian 13) ----------------------------------------------------------------
 PACKAGES := gcc make pkg-config libopenexr-dev libembree-dev libassimp-dev libjansson-dev libtiff-dev libpng-dev libjpeg-dev libexpat1-dev liblapacke-dev libopenblas-dev libcmocka-dev perl help2man dcraw gnuplot-nox \
   libgphoto2-dev libgpiod-dev libinih-dev libmicrohttpd-dev libraw-dev libsystemd-dev libumockdev-dev umockdev libusb-1.0-0-dev libxxhash-dev \
-  gcc-avr avr-libc libsimavr-dev libelf-dev
+  gcc-avr avr-libc libsimavr-dev libelf-dev time
 PACKAGES_TEST := chromium gphoto2 libimage-exiftool-perl hugin-tools libsuitesparse-dev
 PACKAGES_FUZZ := clang libclang-rt-dev
 PACKAGES_BENCH := libceres-dev g++
@@ -53,10 +53,10 @@ FUZZED := $(LIBRARY) $(RIG) $(RIGSIM_LIB) $(FIRMWARE_SIM) # what a fuzzer calls 
 
 # ---- rules --------------------------------------------------------------------------------------------------------------
 object = $(patsubst %.c,$(BUILD)/obj/%.o,$(1))
-ifneq ($(filter firmware test test-vm demo bench bench-chain bench-develop bench-firmware bench-panorama bench-rig bench-studios chart figure5 figures stability experiments,$(MAKECMDGOALS)),)
+ifneq ($(filter firmware test test-vm demo bench bench-chain bench-develop bench-firmware bench-panorama bench-rig bench-studios chart figure5 figures results stability experiments,$(MAKECMDGOALS)),)
 FIRST := deps # these install what is missing before the first file is compiled
 endif
-.PHONY: all firmware deps deps-test deps-fuzz deps-bench test test-vm demo bench bench-chain bench-develop bench-firmware bench-panorama bench-rig bench-studios chart figure5 figures stability experiments fuzz check-includes man install clean help
+.PHONY: all firmware deps deps-test deps-fuzz deps-bench test test-vm demo bench bench-chain bench-develop bench-firmware bench-panorama bench-rig bench-studios chart figure5 figures results stability experiments fuzz check-includes man install clean help
 .DELETE_ON_ERROR:
 .SECONDARY:
 
@@ -221,6 +221,9 @@ bench-studios: deps all $(addprefix $(BUILD)/tests/bench/,judge judge_materials 
 	@BIN=$(BUILD)/bin TOOLS=$(BUILD)/tests/bench sh tests/bench/studios.sh $(STUDIOS)
 experiments: deps $(BUILD)/bin/rigsolve $(BUILD)/tests/bench/judge
 	@BIN=$(BUILD)/bin JUDGE=$(BUILD)/tests/bench/judge sh tests/bench/experiments.sh
+RESULTS ?=
+results: deps deps-bench
+	@perl tests/results/measure.pl $(RESULTS)
 CHART_TAKES ?= D3 D5 $(wildcard ../shared/data/studio-pebble)
 chart: deps $(BUILD)/bin/rigsolve $(BUILD)/tests/bench/chart_lights
 	@mkdir -p build/chart && $(BUILD)/tests/bench/chart_lights >build/chart/lights.csv && gnuplot -e "out='build/chart/lights'" tests/bench/chart_lights.gp
@@ -294,6 +297,7 @@ help:
 	@echo 'make bench-rig  the rig with simulated cameras: kills, faults, scale, soak, lag, disks (half an hour; RIG_BENCHES="lag soak")'
 	@echo 'make bench-chain  kill -9 of any process from the cameras to the solve, then every byte is looked at (CHAIN_KILLS="100 20": in 20 rounds)'
 	@echo 'make bench-studios  what the whole chain loses of studios whose answer is known, stage by stage (STUDIOS="FOLDER...")'
+	@echo 'make results    what was promised and what is measured: tests/results/README.md (RESULTS=all; RESULTS="S4 lag")'
 	@echo 'make bench-develop  raws to radiance: seconds and MB per 24-megapixel frame, 85 of them sustained'
 	@echo 'make install    DESTDIR= PREFIX=/usr/local        make deps      Debian packages             make clean'
 	@echo 'variants: VARIANT=debug|asan|tsan; V=1 shows commands'

@@ -5,6 +5,7 @@
 #   rig.pl faults [PAIRS [WHICH]] one of 12 cameras misbehaves: when is it back or out, what do the others notice
 #   rig.pl soak [N]               N takes: descriptors, memory, processes
 #   rig.pl lag [SHOTS]            calibration against the wires' truth
+#   rig.pl hundred                100 cameras: preflight, settings, status and identify, calibration; and links of known speed
 #   rig.pl full                   the disk fills in the middle of a take (a small tmpfs: needs root)
 #   rig.pl eio                    the disk fails in the middle of a take
 # Environment: BIN (build/bin), TMPDIR (a folder on the disk to be measured; kills and faults prefer /dev/shm), SEED, KEEP=1 keeps
@@ -408,7 +409,7 @@ sub scale {
     sleep 60; # two heartbeats
     my $s = now() - $begin;
     my ($rigd_pc, $workers_pc, $sim_pc) = map { 100 * $_ / $s } cpu_s($r->{rigd}) - $daemon, sum(map { cpu_s($_) } @w) - $all, cpu_s($r->{sim}) - $sim;
-    promise($rigd_pc + $workers_pc <= 10, sprintf 'idle CPU <= 10%% of a core: rigd %.2f%% + %d workers %.2f%% over %.0f s (rigsim %.2f%%)', $rigd_pc, scalar @w, $workers_pc, $s, $sim_pc);
+    promise($rigd_pc + $workers_pc <= 10, sprintf 'idle CPU <= 10%% of a core: %.2f%%: rigd %.2f%% + %d workers %.2f%% over %.0f s (rigsim %.2f%%)', $rigd_pc + $workers_pc, $rigd_pc, scalar @w, $workers_pc, $s, $sim_pc);
     my @kb = map { private_kb($_) } @w;
     promise(max(@kb) <= 4096, sprintf '<= 4 MB private memory per worker: median %d kB, most %d kB of %d; rigd %d kB', median(@kb), max(@kb), scalar @kb, private_kb($r->{rigd}));
     stop($r);
@@ -599,8 +600,16 @@ sub true_lag_ms {
     return @lag;
 }
 
+# How far a body opened from the mean of its shot, on average.
+sub misalignment_ms {
+    my ($take) = @_;
+    my @opened_ms = map { 1e-3 * $_->{delay_us} + $_->{lag_ms} } grep { defined $_->{lag_ms} } @{$take->{cameras}};
+    my $mean = sum(@opened_ms) / @opened_ms;
+    return sum(map { abs($_ - $mean) } @opened_ms) / @opened_ms;
+}
+
 sub lag {
-    my ($worst, $skew) = (0, 0);
+    my ($worst, $skew, @misaligned_ms) = (0, 0);
     my $shots_wanted = shift // 60;
     for my $case ([117, 3, 0], [97, 7, 1], [107, 20, 2]) {
         my ($mean, $spread, $seed) = @$case;
@@ -608,7 +617,7 @@ sub lag {
         my @true = true_lag_ms($r);
         start_rigd($r);
         ready($r) or die "does not come up\n";
-        my $shots = sub { map { my $t = capture($r)->{result}; [$t->{spread_ms}, $t->{sigma_ms}] } 1 .. 5 };
+        my $shots = sub { map { my $t = capture($r)->{result}; [$t->{spread_ms}, $t->{sigma_ms}, misalignment_ms(report($r, $t->{id}))] } 1 .. 5 };
         my @before = $shots->();
         my $t = now();
         my $a = request($r, 'calibrate', what => 'lag', shots => $shots_wanted, patience => 300);
@@ -623,10 +632,92 @@ sub lag {
         printf "lag %d +- %d ms, jitter .25 ms, 8 bodies, n = %d..%d, %.0f s: error of the mean %s, most %.3f ms; it says +- %.3f ms\n", $mean, $spread, min(map { $_->{n} } @lag), max(map { $_->{n} } @lag),
             $calibrated_s, join(' ', map { sprintf '%+.3f', $_ } @error), $most, max(map { $_->{error_ms} } @lag);
         printf "    spread of a shot: %.2f ms before, %.2f ms after; sigma %.2f, %.2f ms (medians of 5)\n", $sb, $sa, $gb, $ga;
+        push @misaligned_ms, sum(map { $_->[2] } @after) / @after;
         stop($r);
     }
     promise($worst <= .1, sprintf 'lag: mean to +-.1 ms with n >= 30: %.3f ms (of a jitter of .25 ms, %d shots leave a sigma of %.3f ms by themselves)', $worst, $shots_wanted, .25 / sqrt $shots_wanted);
+    promise(max(@misaligned_ms) <= .25, sprintf 'after calibration a body opens on average <= .25 ms off the mean of its shot: most %.3f ms of %d rigs', max(@misaligned_ms), scalar @misaligned_ms);
     promise($skew <= .25 * 1.5, sprintf 'after calibration only the bodies\' jitter (.25 ms) is left: sigma %.2f ms', $skew);
+}
+
+# ---- a hundred bodies ------------------------------------------------------------------------------------------------------------
+
+sub preflight_s { # and what it found
+    my ($r) = @_;
+    my $t = now();
+    my $a = request($r, 'preflight') // die "rigd left\n";
+    return (now() - $t, $a->{result});
+}
+
+sub hundred {
+    my $r = new_rig(ram => 1, cameras => 100, trigger => "half_press_ms = 60\nhold_ms = 100", set => ['lag_ms=117', 'lag_spread_ms=3', 'lag_jitter_ms=.25']);
+    start_rigd($r);
+    ready($r) or die "100 cameras do not come up\n";
+    my @s;
+    for (1 .. 3) {
+        my ($s, $found) = preflight_s($r);
+        promise(0, 'preflight finds the rig unfit: ' . encode_json($found->{findings}[0])) if !$found->{fit};
+        push @s, $s;
+    }
+    promise(max(@s) <= 3, sprintf 'preflight of 100 bodies that are as they should be, in <= 3 s: most %.2f s, median %.2f s', max(@s), median(@s));
+
+    my (@status_ms, @identify_ms);
+    for my $k (1 .. 50) {
+        my $t = now();
+        request($r, 'status');
+        push @status_ms, 1e3 * (now() - $t);
+    }
+    my $camera = request($r, 'status')->{result}{cameras}[41]{name};
+    for (1 .. 5) {
+        my $t = now();
+        my $a = request($r, 'identify', camera => $camera);
+        push @identify_ms, 1e3 * (now() - $t);
+        promise(0, "identify $camera: $a->{error}{text}") if !$a->{ok};
+    }
+    promise(max(@status_ms) <= 200, sprintf 'the state of 100 cameras in <= 200 ms: median %.1f ms, most %.1f ms', median(@status_ms), max(@status_ms));
+    promise(max(@identify_ms) <= 10000, sprintf 'identify tells its camera in <= 10 s: most %.0f ms', max(@identify_ms));
+
+    my $t = now();
+    my $a = request($r, 'calibrate', what => 'lag', shots => 32, patience => 500);
+    my $s = now() - $t;
+    my @lag = @{$a->{result}{lag} // []};
+    promise(@lag == 100 && $s <= 300, sprintf 'lag of %d bodies in <= 300 s: %.0f s, n = %d..%d', scalar @lag, $s, min(map { $_->{n} } @lag), max(map { $_->{n} } @lag));
+    my $shot = capture($r)->{result};
+    promise(defined $shot->{spread_ms} && defined $shot->{sigma_ms}, sprintf 'a shot reports its spread and sigma: %.2f ms, %.2f ms', $shot->{spread_ms} // -1, $shot->{sigma_ms} // -1);
+
+    # The same bodies are told something else: every setting of theirs that can be changed.
+    end(delete $r->{rigd});
+    my %other = (iso => '400', aperture => '11', shutter => '1/60', whitebalance => 'tungsten');
+    my $config = slurp("$r->{dir}/rigd.conf");
+    $config =~ s/^\Q$_\E = .*\n//m for keys %other;
+    $config =~ s/^\[settings\]\n/"[settings]\n" . join '', map { "$_ = $other{$_}\n" } sort keys %other/me;
+    open(my $c, '>', "$r->{dir}/rigd.conf") or die;
+    print $c $config;
+    close $c;
+    start_rigd($r);
+    ready($r) or die "100 cameras do not come up again\n";
+    my ($told_s, $found) = preflight_s($r);
+    print "    $_->{severity} $_->{camera}: $_->{text}\n" for @{$found->{findings}}[0 .. min(2, $#{$found->{findings}})];
+    promise($found->{fit} && $told_s <= 2, sprintf '%d settings of 100 bodies in <= 2 s, read back, preflight included: %.2f s', scalar keys %other, $told_s);
+    stop($r);
+
+    links($_, 2e6) for 8, 16;
+}
+
+# Every camera's link carries so many bytes a second.
+sub links {
+    my ($n, $rate) = @_;
+    my $r = new_rig(ram => 1, cameras => $n, raw => '2448x1632', rig => "raw_mb = 9\nfree_space_mb = 100\nfetch_limit = $n\n", faults => "* at 0s slow $rate\n");
+    start_rigd($r);
+    ready($r) or die "$n cameras do not come up\n";
+    capture($r, name => 'warm');
+    my $shot = capture($r, name => 'links')->{result};
+    my $copied_s = max(map { 1e-3 * ($_->{copied_ms} // 0) } map { @{$_->{files}} } @{report($r, $shot->{id})->{cameras}});
+    my $ideal_s = $shot->{bytes} / ($n * $rate);
+    my $cpu_s = cpu_s($r->{sim}) + sum(map { cpu_s($_) } $r->{rigd}, workers($r));
+    promise($ideal_s >= .85 * $copied_s, sprintf 'links of %d x %.0f MB/s used to >= 85 %%: %.1f %% (all safe %.2f s after the shot, names, thumbnails and checks included; the bytes alone need %.2f s; processor of everything so far %.1f s)',
+        $n, 1e-6 * $rate, 100 * $ideal_s / $copied_s, $copied_s, $ideal_s, $cpu_s);
+    stop($r);
 }
 
 # ---- full and failing disks ------------------------------------------------------------------------------------------------------
@@ -718,7 +809,7 @@ sub eio {
     }
 }
 
-my %commands = (kills => \&kills, scale => \&scale, faults => \&faults, soak => \&soak, lag => \&lag, full => \&full, eio => \&eio);
+my %commands = (kills => \&kills, scale => \&scale, faults => \&faults, soak => \&soak, lag => \&lag, hundred => \&hundred, full => \&full, eio => \&eio);
 my $what = shift // '';
 $SIG{INT} = $SIG{TERM} = sub { exit 2 };
 my $main = $$;
