@@ -244,7 +244,7 @@ stability: deps deps-bench $(BUILD)/tests/bench/stability_kernels $(BUILD)/tests
 	@echo "stability: build/stability/joint.csv .svg .png: where the lights are found, where not, and whether the solver says so"
 
 # ---- installation ---------------------------------------------------------------------------------------------------------
-MAN := $(addprefix $(BUILD)/man/rigsolve,.1 $(addprefix -,$(addsuffix .1,$(filter-out arguments chart_draw inputs output solve_materials solved,$(notdir $(COMMANDS:.c=))))))
+MAN := $(addprefix $(BUILD)/man/rigsolve,.1 $(addprefix -,$(addsuffix .1,$(filter-out arguments chart_draw inputs output presets solve_materials solved,$(notdir $(COMMANDS:.c=))))))
 RIG_MAN := $(addprefix $(BUILD)/man/,rigctl.1 rigctl-develop.1 rigctl-calibrate-colour.1 rigd-develop.1 rigd.8)
 man: $(MAN) $(RIG_MAN)
 $(BUILD)/man/rigctl.1: $(BUILD)/bin/rigctl

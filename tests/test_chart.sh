@@ -51,7 +51,7 @@ result $? "and named, with what is expected"
 tiny="--size 60x40 --views 12 --hold-out every:4 --base-lights 16 --base-texture 8 --lights 16,32 --texture 8,32 --methods alternating,directional --kernels none --threads 2"
 gives 0 "a chart of a tiny studio" "$rigsolve" chart D3 -o "$dir/chart" $tiny --presets preview --preset-scale 8
 table "$dir/chart/chart.csv" '@r == 5 && join(" ", map "$_->{axis}:$_->{method}:$_->{preset}:$_->{stage}:$_->{n_lights}:$_->{texture}", @r) eq
-    "base:alternating::2:16:8 texture:alternating::2:16:32 lights:alternating::2:32:8 method:directional::2:16:8 preset:joint:preview:1:256:16"'
+    "base:alternating::2:16:8 texture:alternating::2:16:32 lights:alternating::2:32:8 method:directional::2:16:8 preset:joint:preview:1:64:16"'
 result $? "has the base, one row for each value that differs from it, and the preset, each with its settings"
 table "$dir/chart/chart.csv" '!grep { $_->{set} ne "D3" || $_->{solved} ne "yes" || $_->{n_views} != 12 || $_->{n_held_out} != 3 || $_->{width_px} != 60 || $_->{cpu_s} <= 0 ||
     $_->{peak_rss_bytes} < 1e7 || $_->{rmse_held_out_percent} <= 0 || $_->{rmse_pictures_percent} <= 0 || $_->{n_observations} < 1 || $_->{kernel} !~ /^\w+$/ } @r'

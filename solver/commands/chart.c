@@ -9,6 +9,7 @@
 #include "solver/commands/commands.h"
 #include "solver/commands/inputs.h"
 #include "solver/commands/output.h"
+#include "solver/commands/presets.h"
 #include "solver/commands/solved.h"
 #include "solver/csv.h"
 #include "solver/kernels/kernels.h"
@@ -37,8 +38,7 @@
 extern char **environ;
 
 enum { MAX_SETS = 12, MAX_VALUES = 16, MAX_POINTS = 5 * MAX_VALUES, MAX_ROWS = 100000, JUDGED_VIEWS = 3, JUDGED_WIDTH_PX = 480, WHOLE_PATH = 4096 };
-static const char *const methods[] = { "joint", "alternating", "directional" }, *const kernel_names[] = { "reference", "portable", "avx2", "avx512" },
-                  *const presets[] = { "preview", "standard", "final" };
+static const char *const methods[] = { "joint", "alternating", "directional" }, *const kernel_names[] = { "reference", "portable", "avx2", "avx512" };
 
 // ---- the command line ------------------------------------------------------------------------------------------------------
 
@@ -168,7 +168,7 @@ static error_t parse(int key, char *text, struct argp_state *state)
         a->has_kernels = true;
         return 0;
     case KEY_PRESETS:
-        parse_names(state, "--presets", text, presets, 3, a->presets, &a->n_presets);
+        parse_names(state, "--presets", text, preset_names, N_PRESETS, a->presets, &a->n_presets);
         a->has_presets = true;
         return 0;
     case KEY_BASE_LIGHTS:
@@ -235,7 +235,7 @@ static void put_defaults(struct arguments *a)
         if (kernels_by_name(kernel_names[i]))
             a->kernels[a->n_kernels++] = kernel_names[i];
     for (int i = 0; !a->has_presets && i < 2; i++)
-        a->presets[a->n_presets++] = presets[i];
+        a->presets[a->n_presets++] = preset_names[i];
     if (!a->n_sets) {
         a->sets[a->n_sets++] = "D3";
         a->sets[a->n_sets++] = "D5";
@@ -596,8 +596,10 @@ static int list_points(struct chart_row *point, const struct set *s, const struc
         }
     for (int i = 0; i < a->n_presets; i++) {
         point[n] = base;
-        point[n].n_lights = 256, point[n].stage = !strcmp(a->presets[i], "preview") ? 1 : 2;
-        point[n].texture = (!strcmp(a->presets[i], "preview") ? 128 : !strcmp(a->presets[i], "standard") ? 512 : 2048) / scale;
+        const struct preset *p = presets;
+        while (strcmp(p->name, a->presets[i]))
+            p++;
+        point[n].n_lights = p->n_lights, point[n].stage = p->last_stage, point[n].texture = p->texture / scale;
         snprintf(point[n].method, CHART_NAME_MAX, "joint");
         snprintf(point[n].preset, CHART_NAME_MAX, "%s", a->presets[i]);
         snprintf(point[n++].axis, CHART_NAME_MAX, "preset");

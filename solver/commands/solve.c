@@ -3,6 +3,7 @@
 #include "solver/commands/commands.h"
 #include "solver/commands/export.h"
 #include "solver/commands/inputs.h"
+#include "solver/commands/presets.h"
 #include "solver/commands/report.h"
 #include "solver/commands/solve_materials.h"
 #include "solver/joint.h"
@@ -22,19 +23,6 @@
 #include <string.h>
 #include <sys/resource.h>
 #include <time.h>
-
-// What the presets are. A preview is for the eyes of those who could still shoot again: lights in 64 groups, shared material, few samples.
-static const struct preset {
-    const char *name;
-    int last_stage, texture, texture_stage1; // texture_stage1: with --stage 1
-    int n_lights, coarse_samples, fine_samples;
-    int page_views;
-    bool quick_page;
-} presets[] = {
-    { "preview", 1, 128, 128, 64, 12000, 60000, 2, true },
-    { "standard", 2, 512, 256, 256, 30000, 200000, 4, false },
-    { "final", 2, 2048, 512, 256, 30000, 200000, 4, false },
-};
 
 struct settings {
     const char *out, *hold_out;
@@ -91,7 +79,7 @@ static const char doc[] =
 
 static error_t parse_option(int key, char *text, struct argp_state *state)
 {
-    static const char *const preset_names[] = { "preview", "standard", "final" }, *const models[] = { "disney", "lambert" };
+    static const char *const models[] = { "disney", "lambert" };
     struct settings *s = state->input;
     switch (key) {
     case ARGP_KEY_INIT:
@@ -99,7 +87,7 @@ static error_t parse_option(int key, char *text, struct argp_state *state)
         state->child_inputs[1] = &s->materials;
         return 0;
     case OPTION_PRESET:
-        s->preset = &presets[argument_choice(state, "--preset", text, preset_names, 3)];
+        s->preset = &presets[argument_choice(state, "--preset", text, preset_names, N_PRESETS)];
         return 0;
     case OPTION_METHOD:
         s->joint.method = (enum method)argument_choice(state, "--method", text, method_names, 3);
@@ -444,7 +432,7 @@ int command_solve(int argc, char **argv)
     const struct argp_child children[] = { { &inputs_argp, 0, NULL, 0 }, { &solve_materials_argp, 0, NULL, 0 }, { 0 } };
     const struct argp argp = { options, parse_option, "TAKE -o DIR\n--mesh M --cameras C --images DIR --panorama P -o DIR", doc,
                                children, 0, 0 };
-    struct settings s = { .preset = &presets[1], .hold_out = "every:7", .seed = 1 };
+    struct settings s = { .preset = &presets[PRESET_STANDARD], .hold_out = "every:7", .seed = 1 };
     struct scene scene = { 0 };
     struct joint_result result = { 0 };
     struct materials materials = { 0 };
