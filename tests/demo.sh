@@ -86,7 +86,7 @@ place_cameras() {
     finer=1
     [ -z "$scene" ] || finer=2
     size_px=$(awk -v k=$finer '!/^#/ && NF { print k * $3 "x" k * $4; exit }' "$studio/geometry/cameras/cameras.txt")
-    if [ -f "$studio/unseen.txt" ]; then
+    if [ -n "$scene" ] && [ -f "$studio/unseen.txt" ]; then
         awk 'FNR == NR { name[$1 ".exr"] = $2; next } $1 in name { print name[$1] ".exr" }' "$out/cameras.txt" "$studio/unseen.txt" >"$out/unseen.txt"
     fi
 }
