@@ -819,7 +819,7 @@ static inline void tear_down(void)
 static inline const struct ledger *capture_as(const char *id, bool without_missing)
 {
     char why[200] = "";
-    const struct rig_take take = { id, "story", "2026-11-22T09:00:00Z", 1795338000000, "/takes", NULL };
+    const struct rig_take take = { id, "story", "2026-11-22T09:00:00Z", 1795338000000, "/takes", NULL, false };
     w.n_copies = 0;
     w.has_durable = false;
     for (int i = 0; i < w.config.n_cameras; i++)

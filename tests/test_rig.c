@@ -110,7 +110,7 @@ static void nothing_is_sent_from_the_last_answer_before_half_press_to_the_end_of
     (void)state;
     for (int calibrated = 0; calibrated < 2; calibrated++)
         for (int ms = 0; ms < 3000; ms += 50) {
-            const struct rig_take take = { "20261122T090000_story", "story", "2026-11-22T09:00:00Z", 1795338000000, "/takes", NULL };
+            const struct rig_take take = { "20261122T090000_story", "story", "2026-11-22T09:00:00Z", 1795338000000, "/takes", NULL, false };
             struct lag lag[5];
             char why[200];
             set_up(5, 200 + (uint64_t)ms);
@@ -408,7 +408,7 @@ static void a_trigger_that_fails_is_survived(void **state)
     assert_int_equal(l->state, TAKE_VERIFIED);
     rig_trigger_is(w.rig, w.now, -1);
     char why[200];
-    const struct rig_take take = { "x", "x", "", 0, "/takes", NULL };
+    const struct rig_take take = { "x", "x", "", 0, "/takes", NULL, false };
     assert_int_equal(rig_capture(w.rig, w.now, &take, false, why), -ENOTCONN);
     tear_down();
 }
@@ -543,7 +543,7 @@ static void cancelling_before_the_shot_costs_nothing_after_it_no_frame(void **st
         char why[200];
         set_up(4, 80);
         open_all();
-        const struct rig_take take = { "20261122T090000_c", "c", "", 0, "/takes", NULL };
+        const struct rig_take take = { "20261122T090000_c", "c", "", 0, "/takes", NULL, false };
         for (int i = 0; i < 4; i++)
             w.camera[i].take_first = w.camera[i].n_card + 1;
         assert_int_equal(rig_capture(w.rig, w.now, &take, false, why), 0);

@@ -39,7 +39,7 @@ static void begin(enum head_kind kind, uint64_t seed)
 
 static int panorama_as(const char *id, char *why)
 {
-    const struct rig_take take = { id, "story", "2026-11-22T09:00:00Z", 1795338000000, "/takes", NULL };
+    const struct rig_take take = { id, "story", "2026-11-22T09:00:00Z", 1795338000000, "/takes", NULL, false };
     w.n_copies = 0;
     w.has_durable = false;
     for (int i = 0; i < N; i++)
@@ -173,7 +173,7 @@ static void an_ordinary_take_does_without_the_panorama_camera(void **state)
     w.camera[CAMERA].open = false;
     const int n_before = w.camera[CAMERA].n_card;
     char why[200];
-    const struct rig_take take = { "20261122T100000_x", "x", "", 0, "/takes", "20261122T090000_story" };
+    const struct rig_take take = { "20261122T100000_x", "x", "", 0, "/takes", "20261122T090000_story", false };
     assert_int_equal(rig_capture(w.rig, w.now, &take, false, why), 0);
     run(60 * S, true);
     drain_actions();
