@@ -489,6 +489,7 @@ static void a_stage_made_anew_replaces_the_one_before_and_old_ledgers_have_none(
     free(text);
     ledger_free(&back);
     ledger_free(&l);
+    free(config.camera);
 }
 
 static void a_panorama_s_ledger_reads_back_as_it_was_written(void **state)
