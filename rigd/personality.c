@@ -30,6 +30,8 @@ static const char *const body_keys[] = { "serial", "model", "firmware", "battery
 
 // ---- reading -------------------------------------------------------------------------------------------------------------
 
+static const char BLANKS[] = " \t\v\f\r"; // isspace() of the C locale, but for the newline
+
 static char *trim(char *s)
 {
     while (isspace((unsigned char)*s))
@@ -58,7 +60,7 @@ static bool alternatives_are_good(const char *value)
 {
     for (const char *s = value;; s++) {
         const size_t n = strcspn(s, "|");
-        if (strspn(s, " \t") >= n || n >= PERSONALITY_NAME)
+        if (strspn(s, BLANKS) >= n || n >= PERSONALITY_NAME)
             return false;
         s += n;
         if (!*s)
@@ -215,7 +217,7 @@ static bool alternative(const char *value, int i, char out[PERSONALITY_NAME])
     }
     if (!value)
         return false;
-    value += strspn(value, " \t");
+    value += strspn(value, BLANKS);
     size_t n = strcspn(value, "|");
     while (n && isspace((unsigned char)value[n - 1]))
         n--;

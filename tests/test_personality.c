@@ -101,6 +101,7 @@ static void faults_name_file_and_line(void **state)
         { "x = 1\n", "test.conf:1" },
         { "[iso]\ndriver =\n", "test.conf:2" },
         { "[iso]\ndriver = a | | b\n", "test.conf:2" },
+        { "[iso]\ndriver = a | \v | b\n", "test.conf:2" },
         { "[iso]\nkind = number\n", "[iso]" },
         { "[iso]\ndriver = a\n[iso]\ndriver = b\n", "test.conf:3" },
         { "[ISO]\n", "test.conf:1" },
