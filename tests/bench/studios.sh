@@ -1,7 +1,8 @@
 #!/bin/sh
 # tests/bench/studios.sh STUDIO... - what the whole chain loses of a studio whose answer is known, stage by stage. A studio is a folder that
-# `make demo` takes as RIG_SCENE, with truth/ and relit/ (../shared/data/studio-pebble, a folder of `rigsolve synth own`). Each variant is
-# solved with the same options, leaving out the same views, and judged against the truth; what is there already is not made again.
+# `make demo` takes as RIG_SCENE, with truth/ and relit/ (../shared/data/studio-pebble, a folder of `rigsolve synth own`); or LeePerrySmith or
+# shoe: a scan by others under a photographed studio, made here. Each variant is solved with the same options, leaving out the same views, and
+# judged against the truth; what is there already is not made again.
 #   clean alternating directional   the studio's own pictures and panorama, straight to the solver; by the other methods
 #   chain                           tests/demo.sh: button, cameras, bracketed panorama, developing, solve
 #   chain-alternating chain-directional    the chain's pictures and panorama by the other methods
@@ -9,10 +10,10 @@
 #   panorama                        the studio's pictures, the chain's panorama: what photographing the lights costs
 #   noiseless bilinear half coarse  raws of sensors without noise; other demosaicing; no more photosites than the studio has pixels;
 #                                   each with the studio's panorama
-# Environment: OUT (build/studios/out)  BIN (build/bin)  TOOLS (build/tests/bench)  VARIANTS (clean alternating directional chain images panorama)
+# Environment: DATA (../shared/data: the scans' meshes and panoramas)  OUT (build/studios/out)  BIN (build/bin)  TOOLS (build/tests/bench)  VARIANTS (clean alternating directional chain images panorama)
 #   TEXTURE (128)  TABLE=1: only what lies there
 set -eu
-case ${1-} in ''|-*) sed -n '2,14s/^# \{0,1\}//p' "$0"; exit 2 ;; esac
+case ${1-} in ''|-*) sed -n '2,15s/^# \{0,1\}//p' "$0"; exit 2 ;; esac
 bin=${BIN:-build/bin} tools=${TOOLS:-build/tests/bench} texture=${TEXTURE:-128}
 variants=${VARIANTS:-clean alternating directional chain images panorama}
 for p in "$bin/rigsolve" "$tools/judge" "$tools/judge_materials" "$tools/raws"; do [ -x "$p" ] || { echo "studios: no $p: run make bench-studios" >&2; exit 2; }; done
@@ -20,6 +21,23 @@ mkdir -p "${OUT:-build/studios/out}"
 all=$(cd "${OUT:-build/studios/out}" && pwd)
 csv=$all/studios.csv
 say() { printf '%s %s\n' "$(date +%H:%M:%S)" "$*" >&2; }
+
+# LeePerrySmith|shoe: under the octabox of one photographed studio; relit by the strips of another.
+scan() {
+    data=${DATA:-../shared/data} folder=$all/scans/$1
+    [ ! -f "$folder/truth/report.json" ] || return 0
+    rm -rf "$folder"
+    case $1 in
+    LeePerrySmith) set -- "$data/mesh/LeePerrySmith/LeePerrySmith.glb" --flip-v --colour "$data/mesh/LeePerrySmith/Map-COL.jpg" --theta roughness=.5,specular=.4 ;;
+    shoe) set -- "$data/mesh/MaterialsVariantsShoe/MaterialsVariantsShoe.gltf" --colour "$data/mesh/MaterialsVariantsShoe/diffuseBeach.jpg" \
+        --material "$data/mesh/MaterialsVariantsShoe/occlusionRougnessMetalness.jpg" ;;
+    esac
+    [ -f "$1" ] || { echo "studios: no $1: set DATA" >&2; exit 2; }
+    say "$(basename "$folder"): made"
+    mkdir -p "$all/scans"
+    "$bin/rigsolve" synth own -o "$folder" --mesh "$@" --light-from "$data/hdri/studio_small_03_1k.hdr" --relight-from "$data/hdri/brown_photostudio_02_1k.hdr" \
+        --true-lights 8192 --size 360x240 --views 42 --samples 1 --texture 1024 --panorama-width 1024 >"$folder.log" 2>&1 || { say "failed: $(tail -n 1 "$folder.log")"; exit 1; }
+}
 
 hold_out() { # cameras as the chain calls them?
     if [ -f "$studio/unseen.txt" ]; then
@@ -99,7 +117,7 @@ judge() { # NAME: $out/NAME.judge (JSON) and .regions
 row() { # NAME
     tr -d ' \n' <"$out/$1.judge" >"$out/row"
     of() { sed -n "s/.*\"$1\":\([^,}]*\).*/\1/p" "$out/row"; }
-    cpu=$(awk '{ printf "%.0f", $1 + $2 }' "$out/$1.time" 2>/dev/null || echo -)
+    cpu=$(awk 'END { printf "%.0f", $1 + $2 }' "$out/$1.time" 2>/dev/null || echo -)
     awk -v prefix="$name,$1,$(of method | tr -d '"'),$(of trusted),$(of rmse_fit_percent),$(of rmse_held_out_percent),$(sed -n 's/^relit: RMSE \([0-9.]*\) %/\1/p' "$out/$1.regions"),$(of centre_cm),$(of distance_percent),$(of distance_median_percent),$(of distance_weighted_percent),$cpu" '
         function put() { if (region != "") print prefix "," region "," albedo "," p["roughness"] "," p["metallic"] "," p["specular"] }
         /^region/ { put(); region = $2; sub(":", "", region); albedo = ""; next }
@@ -111,6 +129,7 @@ row() { # NAME
 
 echo 'studio,variant,method,trusted,rmse_fit_percent,rmse_held_out_percent,relit_percent,centre_cm,distance_percent,distance_median_percent,distance_weighted_percent,cpu_s,region,albedo_percent,roughness_true,roughness,roughness_rms,metallic_true,metallic,metallic_rms,specular_true,specular,specular_rms' >"$csv.$$"
 for studio; do
+    case $studio in LeePerrySmith|shoe) scan "$studio"; studio=$all/scans/$studio ;; esac
     [ -d "$studio/truth" ] && [ -d "$studio/linear" ] || { echo "studios: $studio: expected a folder with linear/ and truth/" >&2; exit 2; }
     studio=$(cd "$studio" && pwd)
     name=$(basename "$studio")
