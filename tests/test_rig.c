@@ -397,6 +397,9 @@ static void a_trigger_that_fails_is_survived(void **state)
     open_all();
     w.n_fire_refusals = 2; // too late twice, then it works
     assert_int_equal(capture()->state, TAKE_VERIFIED);
+    assert_int_equal(w.n_fires_asked, 3);
+    for (int k = 1; k < 3; k++) // a machine that was late gets longer
+        assert_true(w.fire_lead_ns[k] > w.fire_lead_ns[k - 1]);
     w.n_fire_refusals = 9;
     const struct ledger *l = capture_as("20261122T090001_story", false);
     assert_int_equal(l->state, TAKE_FAILED);
