@@ -229,6 +229,10 @@ gives 2 "render without cameras or turntable is a usage error" "$rigsolve" rende
 gives 0 "report with the take's photographs" "$rigsolve" report "$dir/solve" --take "$dir/diffuse"
 [ "$(grep -c 'the photograph' "$dir/solve/report.html")" = 4 ] && ! grep -qE '<script|http' "$dir/solve/report.html"
 result $? "shows four of them and needs nothing but itself"
+gives 0 "render of the solve, finer than the take's cameras" "$rigsolve" render "$dir/solve" --cameras "$dir/diffuse/geometry/cameras" --size 240x160 -o "$dir/finer"
+gives 0 "report with photographs finer than their cameras" "$rigsolve" report "$dir/solve" --take "$dir/diffuse" --images "$dir/finer" -o "$dir/finer.html"
+perl -0777 -ne '@r = /RMSE ([\d.]+) %/g; print "RMSE @r %\n"; exit(@r == 4 && !grep({ $_ > 1 } @r) ? 0 : 1)' "$dir/finer.html" >>"$dir/log" 2>&1
+result $? "shows them, each seen by its own camera"
 perl -MJSON::PP -0777 -ne '$d = decode_json($_); $d->{views_held_out} = ["cam006"]; print encode_json($d)' "$dir/solve/report.json" >"$dir/solve3/report.json"
 gives 0 "report of a solve that set a view aside" "$rigsolve" report "$dir/solve3" --take "$dir/diffuse"
 grep -q '<h3>cam006 <small>(set aside' "$dir/solve3/report.html"
