@@ -30,7 +30,15 @@ for c in brdf lights visibility synth solve render export report compare; do
 done
 
 small="--size 60x40 --views 10 --true-lights 256 --texture 64 --panorama-width 256 --samples 1"
-gives 0 "synth makes a studio" "$rigsolve" synth D3 -o "$dir/one" --seed 7 --threads 1 $small
+# counts_rows N NAME: what was said on descriptor 3 ends with so many rows of pictures, all done
+counts_rows() {
+    tail -n 1 "$dir/progress" >"$dir/log"
+    grep -q "\"done\":$1,\"total\":$1," "$dir/log"
+    result $? "$2"
+}
+tells="env STUDIORIG_PROGRESS_FD=3 $rigsolve"
+gives 0 "synth makes a studio" $tells synth D3 -o "$dir/one" --seed 7 --threads 1 $small 3>"$dir/progress"
+counts_rows 640 "and says how far it is row by row: a picture may take longer than anyone wants to wait for a word"
 gives 0 "synth makes it again with other threads" "$rigsolve" synth D3 -o "$dir/two" --seed 7 --threads 3 $small
 sums "$dir/one" >"$dir/sums1" && sums "$dir/two" >"$dir/sums2" && [ -s "$dir/sums1" ] && cmp "$dir/sums1" "$dir/sums2" >"$dir/log" 2>&1
 result $? "same seed, same bytes, whatever the thread count"
@@ -44,8 +52,9 @@ gives 2 "lights refuses a count that is no power of two" "$rigsolve" lights "$di
 gives 0 "visibility of a take" "$rigsolve" visibility "$dir/one" -o "$dir/vis" --texture 64 --lights 64
 [ -s "$dir/vis/visibility/cam000.png" ] && [ -s "$dir/vis/visibility/lights.bin" ]
 result $? "visibility leaves one mask per view and the light bits"
-gives 0 "render of the truth by the take's cameras" "$rigsolve" render "$dir/one/truth" --cameras "$dir/one/geometry/cameras" \
-    -o "$dir/views" --samples 1
+gives 0 "render of the truth by the take's cameras" $tells render "$dir/one/truth" --cameras "$dir/one/geometry/cameras" \
+    -o "$dir/views" --samples 1 3>"$dir/progress"
+counts_rows 400 "and says how far it is row by row"
 "$rigsolve" compare "$dir/views" "$dir/one/linear" --json >"$dir/compare.json" 2>"$dir/log"
 result $? "compare of two folders"
 json_has "$dir/compare.json" '$d->{rmse_percent} < .1 || do { print "RMSE $d->{rmse_percent} %\n"; 0 }'
