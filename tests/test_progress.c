@@ -92,7 +92,7 @@ static void a_stage_goes_on_when_one_within_it_has_ended(void **state)
     progress_end();
     progress_add(1);
     progress_end();
-    assert_said((const char *const[]){ "solve 0/5", "solve 3/5", "trace 400/1000", "light 7/7", "trace 1000/1000", "solve 4/5", NULL });
+    assert_said((const char *const[]){ "solve 0/5", "solve 3/5", "trace 400/1000", "light 7/7", "trace 400/1000", "trace 1000/1000", "solve 3/5", "solve 4/5", NULL });
 }
 
 static void a_reader_that_has_gone_is_survived(void **state)

@@ -28,6 +28,7 @@ static struct {
     int64_t total, begin_ns, done;
 } outer[MOST_OUTER]; // stages that this one is within
 static int n_outer;
+static bool inner_shown;
 
 static int64_t now_ns(void)
 {
@@ -78,6 +79,7 @@ static int format_time(char *text, size_t size, double seconds)
 static void draw(int64_t now)
 {
     const int64_t n = atomic_load(&done);
+    inner_shown = n_outer > 0;
     const double seconds = (double)(now - begin_ns) * 1e-9;
     char line[256];
     if (json_fd >= 0) {
@@ -163,6 +165,8 @@ void progress_end(void)
         n_outer--;
         stage = outer[n_outer].stage, total = outer[n_outer].total, begin_ns = outer[n_outer].begin_ns;
         atomic_store(&done, outer[n_outer].done);
+        if (inner_shown && (on_terminal || json_fd >= 0)) // what was said last is over
+            draw(now_ns());
     } else if (stage) {
         if (on_terminal || json_fd >= 0)
             draw(now_ns());
