@@ -246,7 +246,12 @@ static void print_step_event(const struct json *body)
 // Of a program at work: at once on a terminal; in a file or a pipe when nothing was said for two seconds.
 static void print_how_far(const struct json *p)
 {
-    begins("%s: %s %.0f of %.0f", text_of(p, "step"), text_of(p, "stage"), number_of(p, "done", 0), number_of(p, "total", 0));
+    const char *step = text_of(p, "step"), *stage = text_of(p, "stage");
+    const double n_done = number_of(p, "done", 0), n = number_of(p, "total", 0);
+    if (n_done < n)
+        begins("%s: %s %.0f of %.0f", step, stage, n_done, n);
+    else
+        begins("%s: after %s", step, stage); // what follows has not said its name
     if (isatty(2))
         tell_what_is_under_way();
 }

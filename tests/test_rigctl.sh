@@ -41,10 +41,10 @@ daemon <<'E2'
 {"v":1,"event":"processing","body":{"take":"t","step":{"step":"standard","state":"running","n":1,"n_done":0}}}
 {"v":1,"event":"progress","body":{"take":"t","step":"standard","stage":"materials","done":6,"total":8}}
 sleep .1
-{"v":1,"event":"progress","body":{"take":"t","step":"standard","stage":"materials","done":7,"total":8}}
+{"v":1,"event":"progress","body":{"take":"t","step":"standard","stage":"materials","done":8,"total":8}}
 sleep 2.2
 E2
-says "what a step said last is told though it is silent now" '^  standard: materials 7 of 8$' process t --watch
+says "what a step said last is told though it is silent now, and not as if it went on" '^  standard: after materials$' process t --watch
 
 daemon <<'E3'
 {"v":1,"event":"say","body":{"severity":"info","text":"lag: shot 1 of 5"}}
