@@ -328,7 +328,8 @@ static void end_lag_shot(struct rig *r, int64_t now)
         if (b->part && b->flash_ns != INT64_MIN && b->n_samples < r->n_shots_wanted)
             b->sample_ms[b->n_samples++] = 1e-6 * (double)(b->flash_ns - r->pressed_ns);
     }
-    if (++r->n_shots < r->n_shots_wanted && !r->cancelled) {
+    rig_say(r, RIG_INFO, CONFIG_NONE, "lag: shot %d of %d", ++r->n_shots, r->n_shots_wanted);
+    if (r->n_shots < r->n_shots_wanted && !r->cancelled) {
         begin_arm(r, now);
         return;
     }

@@ -19,7 +19,7 @@
 #include <time.h>
 #include <unistd.h>
 
-enum { EXIT_DONE = 0, EXIT_FAILED = 1, EXIT_USAGE = 2, LINE_MAX_BYTES = 64 << 20, OPTION_OPEN = 256, OPTION_MERGE, OPTION_ON_BUTTON };
+enum { EXIT_DONE = 0, EXIT_FAILED = 1, EXIT_USAGE = 2, LINE_MAX_BYTES = 64 << 20, PATIENCE_NS = 1900000000, OPTION_OPEN = 256, OPTION_MERGE, OPTION_ON_BUTTON };
 
 struct arguments {
     const char *socket_path, *name, *again, *merge, *output, *word[3];
@@ -57,6 +57,79 @@ static int connect_to(const char *path)
     return fd;
 }
 
+static int64_t clock_ns(void)
+{
+    struct timespec t;
+    clock_gettime(CLOCK_MONOTONIC, &t);
+    return (int64_t)t.tv_sec * 1000000000 + t.tv_nsec;
+}
+
+// What is under way is said again where nothing else is; "": nothing is, or a person was asked for something.
+static struct {
+    char text[200];
+    int64_t since_ns, told_ns; // when people heard something last
+    bool stands;               // on this line of the terminal
+} under_way;
+
+static __attribute__((format(printf, 1, 2))) void begins(const char *format, ...)
+{
+    char text[sizeof(under_way.text)];
+    va_list args;
+    va_start(args, format);
+    vsnprintf(text, sizeof(text), format, args);
+    va_end(args);
+    if (!strcmp(text, under_way.text))
+        return;
+    memcpy(under_way.text, text, sizeof(text));
+    under_way.since_ns = clock_ns();
+}
+
+static void wipe(void)
+{
+    if (under_way.stands)
+        fputs("\r\033[K", stderr);
+    under_way.stands = false;
+}
+
+static __attribute__((format(printf, 1, 2))) void tell(const char *format, ...)
+{
+    va_list args;
+    wipe();
+    va_start(args, format);
+    vfprintf(stderr, format, args);
+    va_end(args);
+    fputc('\n', stderr);
+    under_way.told_ns = clock_ns();
+}
+
+// Over the line before on a terminal.
+static void tell_what_is_under_way(void)
+{
+    const int64_t now = clock_ns();
+    wipe();
+    fprintf(stderr, "  %s", under_way.text);
+    if (under_way.since_ns <= under_way.told_ns)
+        fprintf(stderr, ": for %.0f s", 1e-9 * (double)(now - under_way.since_ns));
+    under_way.stands = isatty(2);
+    if (!under_way.stands)
+        fputc('\n', stderr);
+    under_way.told_ns = now;
+}
+
+// Until the daemon says something. A word every two seconds; in a log of what takes hours, fewer.
+static void wait_for_daemon(int fd)
+{
+    struct pollfd p = { .fd = fd, .events = POLLIN };
+    while (under_way.text[0]) {
+        const int64_t long_ns = isatty(2) ? 0 : (under_way.told_ns - under_way.since_ns) / 30;
+        const int64_t wait_ns = under_way.told_ns + (long_ns > PATIENCE_NS ? long_ns : PATIENCE_NS) - clock_ns();
+        if (wait_ns <= 0)
+            tell_what_is_under_way();
+        else if (poll(&p, 1, (int)(wait_ns / 1000000) + 1) > 0)
+            return;
+    }
+}
+
 // The next line as JSON; NULL: the daemon has left.
 static struct json *next_message(struct line_reader *r)
 {
@@ -77,6 +150,7 @@ static struct json *next_message(struct line_reader *r)
                 return NULL;
             r->bytes = grown;
         }
+        wait_for_daemon(r->fd);
         const ssize_t n = read(r->fd, r->bytes + r->n, r->room - r->n);
         if (n < 0 && errno == EINTR)
             continue;
@@ -133,67 +207,74 @@ static void print_progress(const struct json *p)
 {
     const char *step = text_of(p, "step"), *text = text_of(p, "text");
     const double stop = number_of(p, "stop", 0), n_stops = number_of(p, "n_stops", 0);
-    if (!strcmp(step, "turn"))
-        fprintf(stderr, "  stop %.0f of %.0f: to yaw %g, pitch %g\n", stop, n_stops, number_of(p, "yaw_deg", 0), number_of(p, "pitch_deg", 0));
-    else if (!strcmp(step, "expose"))
-        fprintf(stderr, "  stop %.0f of %.0f: exposure %.0f, %s s\n", stop, n_stops, number_of(p, "frame", 0), text_of(p, "exposure"));
-    else if (!strcmp(step, "frame"))
-        fprintf(stderr, "    %s\n", text);
-    else
-        fprintf(stderr, "  stop %.0f of %.0f is done: %s\n", stop, n_stops, text);
+    if (!strcmp(step, "frame")) {
+        tell("    %s", text);
+    } else if (!strcmp(step, "stop_done")) {
+        tell("  stop %.0f of %.0f is done: %s", stop, n_stops, text);
+    } else {
+        if (!strcmp(step, "turn"))
+            begins("stop %.0f of %.0f: to yaw %g, pitch %g", stop, n_stops, number_of(p, "yaw_deg", 0), number_of(p, "pitch_deg", 0));
+        else
+            begins("stop %.0f of %.0f: exposure %.0f, %s s", stop, n_stops, number_of(p, "frame", 0), text_of(p, "exposure"));
+        tell("  %s", under_way.text);
+    }
 }
 
-static int64_t clock_ns(void)
-{
-    struct timespec t;
-    clock_gettime(CLOCK_MONOTONIC, &t);
-    return (int64_t)t.tv_sec * 1000000000 + t.tv_nsec;
-}
-
-// One line when a step changes, another when it is done; how far it has come goes over the line before on a terminal.
+// One line when a step changes, another when it is done.
 static void print_step_event(const struct json *body)
 {
     static char last[200];
     char line[200];
-    const char *state = text_of(body, "step.state");
+    const char *step = text_of(body, "step.step"), *state = text_of(body, "step.state");
     const double n = number_of(body, "step.n", 0);
+    const bool runs = !strcmp(state, "running");
+    if (runs && n > 1)
+        snprintf(line, sizeof(line), "%s: %.0f of %.0f", step, number_of(body, "step.n_done", 0), n);
+    else
+        snprintf(line, sizeof(line), "%s: %s%s%.120s", step, state, text_of(body, "step.text")[0] ? ": " : "", text_of(body, "step.text"));
+    if (runs)
+        begins("%s", line);
+    else if (!strncmp(under_way.text, step, strlen(step)))
+        begins("%s", "");
     if (!strcmp(state, "looking") || !strcmp(state, "waiting") || !strcmp(state, "queued"))
         return;
-    if (!strcmp(state, "running") && n > 1)
-        snprintf(line, sizeof(line), "  %s: %.0f of %.0f", text_of(body, "step.step"), number_of(body, "step.n_done", 0), n);
-    else
-        snprintf(line, sizeof(line), "  %s: %s%s%.120s", text_of(body, "step.step"), state, text_of(body, "step.text")[0] ? ": " : "", text_of(body, "step.text"));
     if (strcmp(line, last))
-        fprintf(stderr, "%s\n", line);
-    snprintf(last, sizeof(last), "%s", line);
+        tell("  %s", line);
+    memcpy(last, line, sizeof(last));
 }
 
-// Of a program at work: over the line before on a terminal; in a file or a pipe a line when nothing was said of it for two seconds.
+// Of a program at work: at once on a terminal; in a file or a pipe when nothing was said for two seconds.
 static void print_how_far(const struct json *p)
 {
-    static int64_t next_ns;
-    const int64_t now = clock_ns();
-    if (!isatty(2) && now < next_ns)
-        return;
-    next_ns = now + 1800000000; // the next news may be late
-    fprintf(stderr, "  %s: %s %.0f of %.0f%s", text_of(p, "step"), text_of(p, "stage"), number_of(p, "done", 0), number_of(p, "total", 0), isatty(2) ? "\033[K\r" : "\n");
+    const char *step = text_of(p, "step"), *stage = text_of(p, "stage");
+    const double n_done = number_of(p, "done", 0), n = number_of(p, "total", 0);
+    if (n_done < n)
+        begins("%s: %s %.0f of %.0f", step, stage, n_done, n);
+    else
+        begins("%s: after %s", step, stage); // what follows has not said its name
+    if (isatty(2))
+        tell_what_is_under_way();
 }
 
 static void print_event(const struct json *message)
 {
     const char *event = text_of(message, "event");
-    if (!strcmp(event, "processing"))
-        print_step_event(json_get(message, "body"));
-    else if (!strcmp(event, "progress"))
-        print_how_far(json_get(message, "body"));
-    if (!strcmp(event, "state"))
-        fprintf(stderr, "  %s\n", text_of(message, "body.state"));
-    else if (!strcmp(event, "say"))
-        fprintf(stderr, "  %s: %s\n", text_of(message, "body.severity"), text_of(message, "body.text"));
-    else if (!strcmp(event, "panorama"))
-        print_progress(json_get(message, "body"));
-    else if (!strcmp(event, "prompt") && flag_of(message, "body.on"))
-        fprintf(stderr, "  ==> %s\n", text_of(message, "body.text"));
+    const struct json *body = json_get(message, "body");
+    if (!strcmp(event, "processing")) {
+        print_step_event(body);
+    } else if (!strcmp(event, "progress")) {
+        print_how_far(body);
+    } else if (!strcmp(event, "state")) {
+        begins("%s", text_of(body, "state"));
+        tell("  %s", text_of(body, "state"));
+    } else if (!strcmp(event, "say")) {
+        tell("  %s: %s", text_of(body, "severity"), text_of(body, "text"));
+    } else if (!strcmp(event, "panorama")) {
+        print_progress(body);
+    } else if (!strcmp(event, "prompt") && flag_of(body, "on")) {
+        begins("%s", "");
+        tell("  ==> %s", text_of(body, "text"));
+    }
 }
 
 // A person at this terminal was asked to do something: Enter says that it is done. Until then, or until the daemon says something.
@@ -225,6 +306,9 @@ static struct json *ask(const struct arguments *a, struct json *request, bool ev
         struct json *subscribe = request_of("subscribe");
         json_set_int(subscribe, "id", 0);
         send_request(r.fd, subscribe);
+        under_way.told_ns = clock_ns();
+        if (!a->watch) // it may have to wait for hours
+            begins("%s", a->word[0]);
     }
     send_request(r.fd, request);
     bool asked = false;
@@ -253,6 +337,8 @@ static struct json *ask(const struct arguments *a, struct json *request, bool ev
         if (answer != m)
             json_free(m);
     }
+    wipe();
+    begins("%s", "");
     close(r.fd);
     free(r.bytes);
     if (answer && !flag_of(answer, "ok")) {
@@ -387,10 +473,16 @@ static void print_lag(const struct json *l)
 
 // ---- commands ----------------------------------------------------------------------------------------------------------------------------
 
+// What happens meanwhile is for people: calls that take longer than they expect show it in a pipe, too.
+static bool is_watched(const struct arguments *a)
+{
+    return !a->json && isatty(2);
+}
+
 // Ask; with --json print the result as it is, else by print. 0 and *out (if wanted), or EXIT_FAILED.
 static int ask_and_print(const struct arguments *a, struct json *request, bool events, void (*print)(const struct json *), struct json **out)
 {
-    struct json *answer = ask(a, request, events && !a->json && (isatty(2) || a->watch));
+    struct json *answer = ask(a, request, events);
     if (!answer)
         return EXIT_FAILED;
     const struct json *result = json_get(answer, "result");
@@ -426,7 +518,7 @@ static int status(const struct arguments *a)
 static int healthy(const struct arguments *a, const char *what, const char *flag)
 {
     struct json *answer = NULL;
-    const int err = ask_and_print(a, request_of(what), true, print_findings, &answer);
+    const int err = ask_and_print(a, request_of(what), is_watched(a), print_findings, &answer);
     if (err)
         return err;
     char path[40];
@@ -451,7 +543,7 @@ static int preflight(const struct arguments *a)
 static int take_result(const struct arguments *a, struct json *request)
 {
     struct json *answer = NULL;
-    const int err = ask_and_print(a, request, true, print_take, &answer);
+    const int err = ask_and_print(a, request, is_watched(a), print_take, &answer);
     if (err)
         return err;
     const char *state = text_of(answer, "result.state"); // one that is resumed may have come further before
@@ -640,7 +732,7 @@ static int process(const struct arguments *a)
     json_set_bool(r, "wait", a->watch);
     if (a->watch && !a->json)
         fprintf(stderr, "take %s\n", a->word[1]);
-    const int err = ask_and_print(a, r, a->watch, print_process, &answer);
+    const int err = ask_and_print(a, r, a->watch && !a->json, print_process, &answer);
     const int code = err ? err : a->watch ? outcome_of(json_get(answer, "result")) : EXIT_DONE;
     json_free(answer);
     return code;
@@ -670,7 +762,7 @@ static int preview(const struct arguments *a)
 {
     struct json *r = about_take("preview", a->word[1]), *answer = NULL;
     json_set_bool(r, "wait", true);
-    const int err = ask_and_print(a, r, true, print_preview, &answer);
+    const int err = ask_and_print(a, r, is_watched(a), print_preview, &answer);
     const int code = err ? err : outcome_of(json_get(answer, "result"));
     json_free(answer);
     return code;
@@ -696,7 +788,7 @@ static int calibrate(const struct arguments *a)
     json_set_string(r, "what", a->word[1]);
     if (a->shots)
         json_set_int(r, "shots", a->shots);
-    const int err = ask_and_print(a, r, true, print_lag, &answer);
+    const int err = ask_and_print(a, r, !a->json, print_lag, &answer);
     if (err)
         return err;
     const bool good = !text_of(answer, "result.outcome")[0];

@@ -11,6 +11,7 @@
 #include "solver/parallel.h"
 #include "solver/random.h"
 #include "solver/take/log.h"
+#include "solver/take/progress.h"
 #include "solver/texels.h"
 #include "solver/vec3.h"
 
@@ -830,6 +831,8 @@ static void render_rows(void *arg, int64_t begin, int64_t end, int worker)
         for (int x = 0; x < job->out->width; x++)
             render_pixel(job, x, (int)y, &job->scratch[worker],
                          job->out->data + 4 * ((size_t)y * (size_t)job->out->width + (size_t)x));
+    if (job->renderer->settings.count_rows)
+        progress_add(end - begin);
 }
 
 static uint64_t hash_name(const char *name)

@@ -32,6 +32,7 @@ struct render_settings {
     int bounce_texture; // size of the radiosity texture (e.g. 256)
     uint64_t seed;
     int n_threads;
+    bool count_rows; // each row of a picture that is done is a progress_add(1)
 };
 
 struct renderer;

@@ -57,12 +57,12 @@ static double number_of(const struct json *v, const char *path)
 
 // ---- pictures -------------------------------------------------------------------------------------------------------------
 
-// The same of n channels from the first on.
-static int shrink(struct image *out, const struct image *image, int first, int n, int width, int height)
+// The same of the n channels that are named by their numbers.
+static int shrink(struct image *out, const struct image *image, const int *channel, int n, int width, int height)
 {
     const char *names[IMAGE_MAX_CHANNELS];
     for (int c = 0; c < n; c++)
-        names[c] = image->names[first + c];
+        names[c] = image->names[channel[c]];
     const int err = image_new(out, width, height, n, names);
     if (err)
         return err;
@@ -73,9 +73,9 @@ static int shrink(struct image *out, const struct image *image, int first, int n
             for (int j = (int)(y * sy); j < image->height && j < (y + 1) * sy; j++)
                 for (int i = (int)(x * sx); i < image->width && i < (x + 1) * sx; i++) {
                     const double w = (fmin(i + 1, (x + 1) * sx) - fmax(i, x * sx)) * (fmin(j + 1, (y + 1) * sy) - fmax(j, y * sy));
-                    const float *p = image->data + ((size_t)j * (size_t)image->width + (size_t)i) * (size_t)image->n_channels + first;
+                    const float *p = image->data + ((size_t)j * (size_t)image->width + (size_t)i) * (size_t)image->n_channels;
                     for (int c = 0; c < n; c++)
-                        sum[c] += w * (double)p[c];
+                        sum[c] += w * (double)p[channel[c]];
                 }
             for (int c = 0; c < n; c++)
                 out->data[((size_t)y * (size_t)width + (size_t)x) * (size_t)n + (size_t)c] = (float)(sum[c] / (sx * sy));
@@ -85,7 +85,29 @@ static int shrink(struct image *out, const struct image *image, int first, int n
 
 int report_shrink(struct image *out, const struct image *image, int width, int height)
 {
-    return shrink(out, image, 0, image->n_channels, width, height);
+    int all[IMAGE_MAX_CHANNELS];
+    for (int c = 0; c < image->n_channels; c++)
+        all[c] = c;
+    return shrink(out, image, all, image->n_channels, width, height);
+}
+
+int report_photograph(struct image *out, struct camera *small, const struct image *picture, const struct camera *camera)
+{
+    static const char *const names[] = { "R", "G", "B" };
+    const int64_t across = llabs((int64_t)picture->height * camera->width_px - (int64_t)picture->width * camera->height_px);
+    const double longest = fmax(fmax(picture->width, picture->height), fmax(camera->width_px, camera->height_px));
+    const int width = picture->width < REPORT_PICTURE_PX ? picture->width : REPORT_PICTURE_PX;
+    const int height = (int)((int64_t)picture->height * width / picture->width);
+    int channel[3];
+    bool usable = 2 * across <= longest; // one side was rounded to whole pixels
+    *out = (struct image){ 0 };
+    for (int c = 0; c < 3; c++)
+        usable &= (channel[c] = image_channel(picture, names[c])) >= 0;
+    if (!usable)
+        return -EINVAL;
+    *small = *camera;
+    camera_resize(small, width, height > 0 ? height : 1);
+    return shrink(out, picture, channel, 3, small->width_px, small->height_px);
 }
 
 static uint8_t byte_of(double v)
@@ -220,8 +242,8 @@ static int put_map(FILE *f, const struct image *map, int channel, bool colour, d
     const int side = map->width < THUMBNAIL_PX ? map->width : THUMBNAIL_PX;
     char caption[256];
     uint8_t *bytes = NULL;
-    const int n = colour ? 3 : 1;
-    int err = shrink(&small, map, channel, n, side, side);
+    const int n = colour ? 3 : 1, shown[] = { channel, channel + 1, channel + 2 };
+    int err = shrink(&small, map, shown, n, side, side);
     if (!err) {
         bytes = malloc((size_t)side * (size_t)side * (size_t)n);
         err = bytes ? 0 : -ENOMEM;

@@ -35,3 +35,7 @@ bool report_set_aside(const struct json *report, const char *view); // report NU
 
 // Area mean of an image at another size, no larger. 0 or -ENOMEM.
 int report_shrink(struct image *out, const struct image *image, int width, int height);
+
+// R, G, B of a picture, by name, no wider than the page shows; and the camera at that size, whatever size it was calibrated for.
+// 0, -ENOMEM, -EINVAL (not logged): a channel is missing, or the aspect is not the camera's, but for rounding: the solver takes no such picture.
+int report_photograph(struct image *out, struct camera *small, const struct image *picture, const struct camera *camera);

@@ -795,7 +795,6 @@ static int take_picture(struct job *job, const struct renderer *renderer,
         err = write_image(job, &stored, name, s->final_float ? IMAGE_FLOAT : IMAGE_HALF, IMAGE_ZIP);
     }
     image_free(&image), image_free(&stored);
-    progress_add(1);
     return err;
 }
 
@@ -880,7 +879,8 @@ static int prepare(struct job *job)
         .bounce_rays = s->data_set == 4 || s->data_set == SYNTH_OWN ? BOUNCE_RAYS : 0,
         .bounce_texture = s->texture_size < BOUNCE_TEXTURE ? s->texture_size : BOUNCE_TEXTURE,
         .seed = s->seed,
-        .n_threads = s->n_threads};
+        .n_threads = s->n_threads,
+        .count_rows = true};
     int err = s->data_set == SYNTH_OWN ? own_mesh(&job->mesh, s->mesh_path, s->flip_v, job->object_m)
                                        : shape_make(&job->mesh, shape, job->object_m, object_radius_m,
                                                     shape == SHAPE_PEBBLE ? 40000 : 80000);
@@ -969,7 +969,7 @@ static int write_all(const struct synth_settings *s, const char *dir)
     if (!err)
         err = write_known(job);
     if (!err) {
-        progress_begin("synth", s->n_views + N_RELIT);
+        progress_begin("synth", (int64_t)(s->n_views + N_RELIT) * s->height_px);
         err = take_pictures(job, &job->studio, &job->cameras, "linear", STREAM_NOISE);
         if (!err)
             err = write_report(job);

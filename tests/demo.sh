@@ -136,6 +136,7 @@ start_rigd() { # config, then the words before rigd
     until rigctl --json status 2>/dev/null | grep -q "\"n_ready\":$((n_cameras + 1)),"; do
         tries=$((tries + 1))
         [ $tries -lt 300 ] && kill -0 $rigd 2>/dev/null || return 1
+        [ $((tries % 8)) -gt 0 ] || rigctl status 2>/dev/null | head -n 1 | sed 's/^/  /' # some two seconds
         sleep .2
     done
 }
@@ -147,6 +148,7 @@ within() { # tenths of a second, command...
         "$@" && return 0
         sleep .1
         tries=$((tries - 1))
+        [ $((tries % 15)) -gt 0 ] || rigctl status 2>/dev/null | head -n 1 | sed 's/^/  /' # some two seconds
     done
     return 1
 }
@@ -216,7 +218,7 @@ use_rig() {
             start_rigd "$out/rigd.conf" || fail "the cameras did not come up again: see $out/rigd.log"
         fi
     fi
-    step "lag: each body's shutter lag is measured in five shots (some ten seconds), and compensated from now on"
+    step "lag: each body's shutter lag is measured in five shots, and compensated from now on"
     rigctl calibrate lag --shots 5 >"$out/lag.txt" || fail "no lags: see $out/rigd.log"
     tail -n 4 "$out/lag.txt"
 
@@ -290,7 +292,7 @@ if [ -f "$studio/relit/probe.json" ] && [ -d "$studio/relit/linear" ]; then
     panels=$studio/relit/panels.json
     [ -f "$panels" ] || panels=$studio/relit/lights.json
     "$rigsolve" render "$solve" --cameras "$studio/relit/cameras" --panorama "$studio/relit/panorama.exr" --world-from-probe "$studio/relit/probe.json" --panels "$panels" -n 512 \
-        -o "$out/relit" >/dev/null 2>&1
+        -o "$out/relit" >/dev/null
     mask "$studio/relit/cameras" "$studio/relit/panorama.exr" "$studio/relit/probe.json" "$out/masks-relit" ''
     "$rigsolve" compare --mask "$out/masks-relit" "$out/relit" "$studio/relit/linear" >"$out/relit.txt"
     printf 'under other lights (512 of them)       RMSE %s\n' "$(figure "$out/relit.txt")" >>"$out/figures.txt"

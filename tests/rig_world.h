@@ -94,6 +94,8 @@ static struct world {
     int n_to_open;           // pressed bodies whose shutter has not opened
     double shutter_s;
     int n_fired, fire_err, n_fire_refusals, abilities;
+    int64_t fire_lead_ns[16]; // of each shot that was asked for, the last ones: how long before it was due
+    int n_fires_asked;
     bool waits_for_button;   // loaded, not pressed
     struct trigger_shot loaded;
     int64_t open_first_ns[N_MAX];
@@ -562,6 +564,7 @@ static inline void obey(const struct rig_action *a)
         for (int i = 0; i < w.config.n_cameras; i++) // a camera that hears something now may lock up
             if (!(a->shot.skip[i / 64] >> i % 64 & 1))
                 assert_false(w.camera[i].in_flight);
+        w.fire_lead_ns[w.n_fires_asked++ % 16] = a->shot.at_ns - w.now;
         if (w.n_fire_refusals > 0) {
             w.n_fire_refusals--;
             rig_fired(w.rig, w.now, -ETIME, 0, 0);

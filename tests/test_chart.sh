@@ -2,30 +2,7 @@
 # tests/test_chart.sh - rigsolve chart: its rows, that it goes on where it was, that what fails is said, what it draws. Prints TAP.
 # Run from the repository root; BIN is where rigsolve lies.
 set -u
-rigsolve=${BIN:-build/bin}/rigsolve
-dir=$(mktemp -d "${TMPDIR:-/tmp}/studiorig-test-XXXXXX") || exit 1
-trap 'rm -rf "$dir"' EXIT
-n=0 failed=0
-result() { # status, name
-    n=$((n + 1))
-    if [ "$1" = 0 ]; then
-        echo "ok $n - $2"
-    else
-        failed=1
-        echo "not ok $n - $2"
-        sed 's/^/#   /' "$dir/log" | tail -n 15
-    fi
-}
-# gives CODE NAME COMMAND...: the command ends with that exit code
-gives() {
-    code=$1 name=$2
-    shift 2
-    "$@" >"$dir/log" 2>&1 </dev/null
-    got=$?
-    [ "$got" = "$code" ] || echo "exit code $got, expected $code: $*" >>"$dir/log"
-    [ "$got" = "$code" ]
-    result $? "$name"
-}
+. tests/commands_setup.sh
 # table FILE PERL: @r are the rows as hashes; every row has as many fields as the header
 table() {
     perl -e '($f, $test) = @ARGV; open(F, "<", $f) or die "$f: $!"; chomp(@l = <F>); @h = split /,/, shift @l;

@@ -2,30 +2,7 @@
 # tests/test_commands.sh - rigsolve as a user meets it: every command on a small studio, exit codes, bad input. Prints TAP.
 # Run from the repository root; BIN is where rigsolve lies.
 set -u
-rigsolve=${BIN:-build/bin}/rigsolve
-dir=$(mktemp -d "${TMPDIR:-/tmp}/studiorig-test-XXXXXX") || exit 1
-trap 'rm -rf "$dir"' EXIT
-n=0 failed=0
-result() { # status, name
-    n=$((n + 1))
-    if [ "$1" = 0 ]; then
-        echo "ok $n - $2"
-    else
-        failed=1
-        echo "not ok $n - $2"
-        sed 's/^/#   /' "$dir/log" | tail -n 15
-    fi
-}
-# gives CODE NAME COMMAND...: the command ends with that exit code
-gives() {
-    code=$1 name=$2
-    shift 2
-    "$@" >"$dir/log" 2>&1 </dev/null
-    got=$?
-    [ "$got" = "$code" ] || echo "exit code $got, expected $code: $*" >>"$dir/log"
-    [ "$got" = "$code" ]
-    result $? "$name"
-}
+. tests/commands_setup.sh
 # refuses NAME PATTERN COMMAND...: exit code 1, and the message says what the pattern says; nothing on the final name $dir/refused
 refuses() {
     name=$1 pattern=$2
@@ -53,7 +30,15 @@ for c in brdf lights visibility synth solve render export report compare; do
 done
 
 small="--size 60x40 --views 10 --true-lights 256 --texture 64 --panorama-width 256 --samples 1"
-gives 0 "synth makes a studio" "$rigsolve" synth D3 -o "$dir/one" --seed 7 --threads 1 $small
+# counts_rows N NAME: what was said on descriptor 3 ends with so many rows of pictures, all done
+counts_rows() {
+    tail -n 1 "$dir/progress" >"$dir/log"
+    grep -q "\"done\":$1,\"total\":$1," "$dir/log"
+    result $? "$2"
+}
+tells="env STUDIORIG_PROGRESS_FD=3 $rigsolve"
+gives 0 "synth makes a studio" $tells synth D3 -o "$dir/one" --seed 7 --threads 1 $small 3>"$dir/progress"
+counts_rows 640 "and says how far it is row by row: a picture may take longer than anyone wants to wait for a word"
 gives 0 "synth makes it again with other threads" "$rigsolve" synth D3 -o "$dir/two" --seed 7 --threads 3 $small
 sums "$dir/one" >"$dir/sums1" && sums "$dir/two" >"$dir/sums2" && [ -s "$dir/sums1" ] && cmp "$dir/sums1" "$dir/sums2" >"$dir/log" 2>&1
 result $? "same seed, same bytes, whatever the thread count"
@@ -67,8 +52,9 @@ gives 2 "lights refuses a count that is no power of two" "$rigsolve" lights "$di
 gives 0 "visibility of a take" "$rigsolve" visibility "$dir/one" -o "$dir/vis" --texture 64 --lights 64
 [ -s "$dir/vis/visibility/cam000.png" ] && [ -s "$dir/vis/visibility/lights.bin" ]
 result $? "visibility leaves one mask per view and the light bits"
-gives 0 "render of the truth by the take's cameras" "$rigsolve" render "$dir/one/truth" --cameras "$dir/one/geometry/cameras" \
-    -o "$dir/views" --samples 1
+gives 0 "render of the truth by the take's cameras" $tells render "$dir/one/truth" --cameras "$dir/one/geometry/cameras" \
+    -o "$dir/views" --samples 1 3>"$dir/progress"
+counts_rows 400 "and says how far it is row by row"
 "$rigsolve" compare "$dir/views" "$dir/one/linear" --json >"$dir/compare.json" 2>"$dir/log"
 result $? "compare of two folders"
 json_has "$dir/compare.json" '$d->{rmse_percent} < .1 || do { print "RMSE $d->{rmse_percent} %\n"; 0 }'
@@ -229,6 +215,10 @@ gives 2 "render without cameras or turntable is a usage error" "$rigsolve" rende
 gives 0 "report with the take's photographs" "$rigsolve" report "$dir/solve" --take "$dir/diffuse"
 [ "$(grep -c 'the photograph' "$dir/solve/report.html")" = 4 ] && ! grep -qE '<script|http' "$dir/solve/report.html"
 result $? "shows four of them and needs nothing but itself"
+gives 0 "render of the solve, finer than the take's cameras" "$rigsolve" render "$dir/solve" --cameras "$dir/diffuse/geometry/cameras" --size 240x160 -o "$dir/finer"
+gives 0 "report with photographs finer than their cameras" "$rigsolve" report "$dir/solve" --take "$dir/diffuse" --images "$dir/finer" -o "$dir/finer.html"
+perl -0777 -ne '@r = /RMSE ([\d.]+) %/g; print "RMSE @r %\n"; exit(@r == 4 && !grep({ $_ > 1 } @r) ? 0 : 1)' "$dir/finer.html" >>"$dir/log" 2>&1
+result $? "shows them, each seen by its own camera"
 perl -MJSON::PP -0777 -ne '$d = decode_json($_); $d->{views_held_out} = ["cam006"]; print encode_json($d)' "$dir/solve/report.json" >"$dir/solve3/report.json"
 gives 0 "report of a solve that set a view aside" "$rigsolve" report "$dir/solve3" --take "$dir/diffuse"
 grep -q '<h3>cam006 <small>(set aside' "$dir/solve3/report.html"

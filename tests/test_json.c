@@ -292,6 +292,33 @@ static void the_text_keeps_the_order_of_insertion(void **state)
     json_free(doc);
 }
 
+// What a client or a program sent is JSON, but not what was expected: that costs nothing else in this process.
+static void adding_to_what_cannot_hold_it_is_refused_and_spoils_nothing(void **state)
+{
+    (void)state;
+    static const double two[] = { 1, 2 };
+    static const double rows[9] = { 0 };
+    struct json *list = parse("[1]"), *doc = json_object(), *back;
+    assert_int_equal(json_set(list, "key", json_object()), -EINVAL);
+    assert_int_equal(json_set_string(list, "key", "text"), -EINVAL);
+    assert_int_equal(json_set_number(list, "key", .5), -EINVAL);
+    assert_int_equal(json_set_int(list, "key", 1), -EINVAL);
+    assert_int_equal(json_set_bool(list, "key", true), -EINVAL);
+    assert_int_equal(json_set_numbers(list, "key", two, 2), -EINVAL);
+    assert_int_equal(json_set_matrix3(list, "key", rows), -EINVAL);
+    assert_int_equal(json_append(doc, json_object()), -EINVAL);
+    assert_int_equal(json_append_string(doc, "text"), -EINVAL);
+    char *left[] = { json_text(list), json_text(doc) };
+    assert_string_equal(left[0], "[1]");
+    assert_string_equal(left[1], "{}");
+    assert_int_equal(json_set(doc, "list", list), 0);
+    assert_int_equal(json_write(doc, path), 0); // this process still writes
+    assert_int_equal(json_read(&back, path), 0);
+    assert_int_equal(json_length(back, "list"), 1);
+    free(left[0]), free(left[1]);
+    json_free(doc), json_free(back);
+}
+
 static void numbers_have_a_point_in_any_language(void **state)
 {
     (void)state;
@@ -371,6 +398,7 @@ int main(void)
         cmocka_unit_test(every_truncation_is_refused),
         cmocka_unit_test(a_written_document_reads_back_the_same),
         cmocka_unit_test(the_text_keeps_the_order_of_insertion),
+        cmocka_unit_test(adding_to_what_cannot_hold_it_is_refused_and_spoils_nothing),
         cmocka_unit_test(numbers_have_a_point_in_any_language),
         cmocka_unit_test(files_that_cannot_be_read_or_written_are_named),
     };

@@ -237,6 +237,46 @@ static void shrinking_keeps_the_mean_whatever_the_factor(void **unused)
     image_free(&from);
 }
 
+// The whole chain's pictures: finer than what the cameras were calibrated with, and with a channel that says what clipped.
+static void a_picture_of_another_size_than_its_camera_is_shown_by_the_names_of_its_channels(void **unused)
+{
+    (void)unused;
+    static const double centre_m[3] = { 0, 0, 3 }, origin[3] = { 0 }, up[3] = { 0, 1, 0 }, off_axis_m[3] = { .4, -.2, 0 };
+    const struct { int width, height, camera_width, camera_height; } sizes[] = { { 720, 480, 360, 240 }, { 1201, 801, 360, 240 }, { 90, 60, 360, 240 }, { 360, 240, 360, 240 } };
+    struct camera camera = { .model = CAMERA_BROWN, .name = "cam0" }, small;
+    struct image picture, shown;
+    for (size_t s = 0; s < sizeof(sizes) / sizeof(sizes[0]); s++) {
+        const int width = sizes[s].width, height = sizes[s].height;
+        camera.width_px = sizes[s].camera_width, camera.height_px = sizes[s].camera_height;
+        camera.fx = camera.fy = 1.2 * camera.width_px, camera.cx = camera.width_px / 2., camera.cy = camera.height_px / 2.;
+        camera_look_at(&camera, centre_m, origin, up);
+        assert_int_equal(image_new(&picture, width, height, 4, (const char *const[]){ "B", "clip", "R", "G" }), 0);
+        for (int i = 0; i < width * height; i++) {
+            const double x = (i % width + .5) / width, y = (i / width + .5) / height;
+            picture.data[4 * i] = .25f, picture.data[4 * i + 1] = 1, picture.data[4 * i + 2] = (float)x, picture.data[4 * i + 3] = (float)y;
+        }
+        assert_int_equal(report_photograph(&shown, &small, &picture, &camera), 0);
+        assert_true(shown.n_channels == 3 && shown.width == small.width_px && shown.height == small.height_px);
+        assert_int_equal(shown.width, width < REPORT_PICTURE_PX ? width : REPORT_PICTURE_PX);
+        double at[2], there[2], depth_m;
+        assert_true(camera_project(&camera, off_axis_m, at, &depth_m));
+        assert_true(camera_project(&small, off_axis_m, there, &depth_m));
+        for (int i = 0; i < shown.width * shown.height; i++) {
+            const float *p = shown.data + 3 * i;
+            assert_true(fabs((double)p[0] - (i % shown.width + .5) / shown.width) < 1e-3 && fabs((double)p[1] - (i / shown.width + .5) / shown.height) < 1e-3 && p[2] == .25f);
+        }
+        assert_true(fabs(at[0] / camera.width_px - there[0] / small.width_px) < 1e-9 && fabs(at[1] / camera.height_px - there[1] / small.height_px) < 1e-9);
+        image_free(&picture), image_free(&shown);
+    }
+    fill(&picture, 240, 360, 3, 1); // turned
+    assert_int_equal(report_photograph(&shown, &small, &picture, &camera), -EINVAL);
+    image_free(&picture);
+    assert_int_equal(image_new(&picture, 360, 240, 3, (const char *const[]){ "R", "G", "clip" }), 0);
+    assert_int_equal(report_photograph(&shown, &small, &picture, &camera), -EINVAL);
+    assert_null(shown.data);
+    image_free(&picture);
+}
+
 static int set_up(void **unused)
 {
     (void)unused;
@@ -259,6 +299,7 @@ int main(void)
         cmocka_unit_test(every_region_says_which_parameters_are_free),
         cmocka_unit_test(a_page_with_nothing_to_say_is_still_a_page),
         cmocka_unit_test(shrinking_keeps_the_mean_whatever_the_factor),
+        cmocka_unit_test(a_picture_of_another_size_than_its_camera_is_shown_by_the_names_of_its_channels),
     };
     return cmocka_run_group_tests(tests, set_up, tear_down);
 }

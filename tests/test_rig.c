@@ -402,6 +402,9 @@ static void a_trigger_that_fails_is_survived(void **state)
     open_all();
     w.n_fire_refusals = 2; // too late twice, then it works
     assert_int_equal(capture()->state, TAKE_VERIFIED);
+    assert_int_equal(w.n_fires_asked, 3);
+    for (int k = 1; k < 3; k++) // a machine that was late gets longer
+        assert_true(w.fire_lead_ns[k] > w.fire_lead_ns[k - 1]);
     w.n_fire_refusals = 9;
     const struct ledger *l = capture_as("20261122T090001_story", false);
     assert_int_equal(l->state, TAKE_FAILED);
@@ -442,12 +445,20 @@ static void lag_is_measured_and_compensated(void **state)
     const int64_t spread_before = l->spread_ns, sigma_before = l->sigma_ns;
     char why[200];
     const int64_t begin = w.now;
+    w.n_said = 0;
     assert_int_equal(rig_calibrate(w.rig, w.now, 40, why), 0);
     w.calibrating = true;
     run(4000 * S, true);
     w.calibrating = false;
     drain_actions();
     assert_int_equal(w.n_lags_done, 1);
+    int n_told = 0; // it takes a while: each shot is said
+    for (int i = 0; i < w.n_said; i++) {
+        char shot[40];
+        snprintf(shot, sizeof(shot), "lag: shot %d of 40", n_told + 1);
+        n_told += !strcmp(w.said[i], shot);
+    }
+    assert_int_equal(n_told, 40);
     for (int i = 0; i < 100; i++) {
         const struct lag lag = rig_camera(w.rig, i).lag;
         assert_true(lag.n + lag.n_rejected == 40);

@@ -233,6 +233,7 @@ static void choose_settings(struct scene *s, const struct arguments *a)
         .bounce_texture = setting(r, "render.bounce_texture", 16, MAX_BOUNCE_TEXTURE, 256),
         .seed = (uint64_t)seed,
         .n_threads = a->n_threads,
+        .count_rows = true,
     };
     s->material = (struct render_material){
         .model = s->solved.parameters.data ? REFLECT_DISNEY : REFLECT_LAMBERT,
@@ -471,8 +472,11 @@ static int render_views(const struct scene *s, const struct arguments *a)
     int err = renderer_new(&renderer, &s->solved.mesh, s->rays, &s->solved.lights, &s->material, &s->settings);
     if (err)
         return err;
-    progress_begin("render", s->cameras.n);
-    for (int i = 0; !err && i < s->cameras.n; i++, progress_add(1))
+    int64_t n_rows = 0;
+    for (int i = 0; i < s->cameras.n; i++)
+        n_rows += s->cameras.view[i].height_px;
+    progress_begin("render", n_rows);
+    for (int i = 0; !err && i < s->cameras.n; i++)
         err = render_one(renderer, &s->cameras.view[i], a);
     progress_end();
     renderer_free(renderer);
@@ -484,8 +488,8 @@ static int render_turntable(const struct scene *s, const struct arguments *a)
 {
     const struct lights still = s->solved.lights;
     int err = 0;
-    progress_begin("turntable", a->n_turntable);
-    for (int i = 0; !err && i < a->n_turntable; i++, progress_add(1)) {
+    progress_begin("turntable", (int64_t)a->n_turntable * s->cameras.view[0].height_px);
+    for (int i = 0; !err && i < a->n_turntable; i++) {
         struct lights lights = still; // its arrays are shared
         struct camera camera = s->cameras.view[0];
         struct renderer *renderer;

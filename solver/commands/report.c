@@ -180,23 +180,19 @@ static int find_photograph(char **out, const struct page *p, const char *view)
 static int show_view(struct page *p, const struct renderer *renderer, const struct camera *camera, const char *photograph)
 {
     struct report_view *v = &p->view[p->n_views];
-    struct camera small = *camera;
+    struct camera small;
     struct image whole;
     int err = image_read(&whole, photograph);
     if (err)
         return err;
-    if (whole.n_channels < 3 || whole.width != camera->width_px || whole.height != camera->height_px) {
-        log_warning("report: %s has %d x %d pixels and %d channels, its camera %d x %d and 3; it is not shown", photograph, whole.width,
-                    whole.height, whole.n_channels, camera->width_px, camera->height_px);
-        image_free(&whole);
-        return 0;
-    }
-    const int width = whole.width < REPORT_PICTURE_PX ? whole.width : REPORT_PICTURE_PX;
-    const int height = (int)((int64_t)whole.height * width / whole.width);
-    camera_resize(&small, width, height > 0 ? height : 1);
     v->name = camera->name;
-    err = report_shrink(&v->input, &whole, small.width_px, small.height_px);
+    err = report_photograph(&v->input, &small, &whole, camera);
+    if (err == -EINVAL)
+        log_warning("report: %s has %d x %d pixels and %d channels, its camera %d x %d: R, G and B in the same aspect are needed; it is not shown", photograph,
+                    whole.width, whole.height, whole.n_channels, camera->width_px, camera->height_px);
     image_free(&whole);
+    if (err == -EINVAL)
+        return 0;
     if (!err)
         err = render_view(renderer, &small, &v->render);
     if (err)

@@ -266,23 +266,34 @@ static json_t *string_of(const char *text)
     return v;
 }
 
-static void set_value(struct json *object, const char *key, json_t *value)
+// Out of memory, here or when object or value was made.
+static int poison(void)
 {
-    if (object && value && json_object_set(value_of(object), key, value)) {
+    atomic_store(&out_of_memory, true);
+    return -ENOMEM;
+}
+
+static int set_value(struct json *object, const char *key, json_t *value)
+{
+    int err = 0;
+    if (!object || !value) {
+        err = poison();
+    } else if (!json_is_object(value_of(object))) {
+        err = -EINVAL; // a document of others is what it is
+    } else if (json_object_set(value_of(object), key, value)) {
         char *ascii = ascii_of(key);
         if (!ascii || json_object_set(value_of(object), ascii, value))
-            atomic_store(&out_of_memory, true);
+            err = poison();
         free(ascii);
     }
-    if (!object || !value)
-        atomic_store(&out_of_memory, true);
     json_decref(value);
+    return err;
 }
 
 static struct json *built(json_t *v)
 {
     if (!v)
-        atomic_store(&out_of_memory, true);
+        (void)poison();
     return json_of(v);
 }
 
@@ -296,36 +307,42 @@ struct json *json_new_array(void)
     return built((json_array)());
 }
 
-void json_set(struct json *object, const char *key, struct json *value)
+int json_set(struct json *object, const char *key, struct json *value)
 {
-    set_value(object, key, value_of(value));
+    return set_value(object, key, value_of(value));
 }
 
-void json_set_number(struct json *object, const char *key, double value)
+int json_set_number(struct json *object, const char *key, double value)
 {
-    set_value(object, key, isfinite(value) ? json_real(value) : json_null());
+    return set_value(object, key, isfinite(value) ? json_real(value) : json_null());
 }
 
-void json_set_int(struct json *object, const char *key, int64_t value)
+int json_set_int(struct json *object, const char *key, int64_t value)
 {
-    set_value(object, key, json_integer(value));
+    return set_value(object, key, json_integer(value));
 }
 
-void json_set_bool(struct json *object, const char *key, bool value)
+int json_set_bool(struct json *object, const char *key, bool value)
 {
-    set_value(object, key, json_boolean(value));
+    return set_value(object, key, json_boolean(value));
 }
 
-void json_set_string(struct json *object, const char *key, const char *value)
+int json_set_string(struct json *object, const char *key, const char *value)
 {
-    set_value(object, key, string_of(value));
+    return set_value(object, key, string_of(value));
 }
 
-static void append_value(struct json *array, json_t *value)
+static int append_value(struct json *array, json_t *value)
 {
-    if (!array || !value || json_array_append(value_of(array), value))
-        atomic_store(&out_of_memory, true);
+    int err = 0;
+    if (!array || !value)
+        err = poison();
+    else if (!json_is_array(value_of(array)))
+        err = -EINVAL;
+    else if (json_array_append(value_of(array), value))
+        err = poison();
     json_decref(value);
+    return err;
 }
 
 static struct json *array_of_numbers(const double *values, int n)
@@ -336,25 +353,25 @@ static struct json *array_of_numbers(const double *values, int n)
     return array;
 }
 
-void json_set_numbers(struct json *object, const char *key, const double *values, int n)
+int json_set_numbers(struct json *object, const char *key, const double *values, int n)
 {
-    json_set(object, key, array_of_numbers(values, n));
+    return json_set(object, key, array_of_numbers(values, n));
 }
 
-void json_set_matrix3(struct json *object, const char *key, const double rows[9])
+int json_set_matrix3(struct json *object, const char *key, const double rows[9])
 {
     struct json *matrix = json_new_array();
     for (int row = 0; row < 3; row++)
         json_append(matrix, array_of_numbers(rows + 3 * row, 3));
-    json_set(object, key, matrix);
+    return json_set(object, key, matrix);
 }
 
-void json_append(struct json *array, struct json *value)
+int json_append(struct json *array, struct json *value)
 {
-    append_value(array, value_of(value));
+    return append_value(array, value_of(value));
 }
 
-void json_append_string(struct json *array, const char *value)
+int json_append_string(struct json *array, const char *value)
 {
-    append_value(array, string_of(value));
+    return append_value(array, string_of(value));
 }

@@ -34,17 +34,18 @@ int json_require_numbers(const struct json *v, const char *path, double *out, in
 int json_require_string(const struct json *v, const char *path, const char **out, const char *file);
 
 // Writing. Building a tree never fails half way: out of memory is remembered and json_write returns -ENOMEM
-// (every later one of the process too: no half tree is ever written).
+// (every later one of the process too: no half tree is ever written), so that nobody need look at what these return: 0, -ENOMEM, or
+// -EINVAL where a document that was read is no object (no array for json_append): it stays as it is.
 struct json *json_new_object(void);
 struct json *json_new_array(void);
 #define json_object() json_new_object() // jansson owns the linker's names json_object and json_array
 #define json_array() json_new_array()
-void json_set(struct json *object, const char *key, struct json *value); // takes value
-void json_set_number(struct json *object, const char *key, double value); // not finite: null
-void json_set_int(struct json *object, const char *key, int64_t value);
-void json_set_bool(struct json *object, const char *key, bool value);
-void json_set_string(struct json *object, const char *key, const char *value);
-void json_set_numbers(struct json *object, const char *key, const double *values, int n);
-void json_set_matrix3(struct json *object, const char *key, const double rows[9]); // [[..],[..],[..]]
-void json_append(struct json *array, struct json *value); // takes value
-void json_append_string(struct json *array, const char *value);
+int json_set(struct json *object, const char *key, struct json *value); // takes value
+int json_set_number(struct json *object, const char *key, double value); // not finite: null
+int json_set_int(struct json *object, const char *key, int64_t value);
+int json_set_bool(struct json *object, const char *key, bool value);
+int json_set_string(struct json *object, const char *key, const char *value);
+int json_set_numbers(struct json *object, const char *key, const double *values, int n);
+int json_set_matrix3(struct json *object, const char *key, const double rows[9]); // [[..],[..],[..]]
+int json_append(struct json *array, struct json *value); // takes value
+int json_append_string(struct json *array, const char *value);

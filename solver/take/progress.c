@@ -1,6 +1,7 @@
 // solver/take/progress.c - a bar for people, a line now and then for logs, JSON lines for rigd.
 #include "solver/take/progress.h"
 
+#include <assert.h>
 #include <errno.h>
 #include <fcntl.h>
 #include <pthread.h>
@@ -12,7 +13,7 @@
 #include <time.h>
 #include <unistd.h>
 
-enum { BAR_CELLS = 24 };
+enum { BAR_CELLS = 24, MOST_OUTER = 8 };
 static const int64_t REDRAW_NS = 100000000, SILENCE_NS = 1800000000; // the next tick may be late
 
 static pthread_mutex_t lock = PTHREAD_MUTEX_INITIALIZER;
@@ -22,6 +23,12 @@ static bool on_terminal;
 static const char *stage; // NULL: none
 static int64_t total, begin_ns, next_line_ns;
 static _Atomic int64_t done, next_draw_ns;
+static struct {
+    const char *stage;
+    int64_t total, begin_ns, done;
+} outer[MOST_OUTER]; // stages that this one is within
+static int n_outer;
+static bool inner_shown;
 
 static int64_t now_ns(void)
 {
@@ -72,6 +79,7 @@ static int format_time(char *text, size_t size, double seconds)
 static void draw(int64_t now)
 {
     const int64_t n = atomic_load(&done);
+    inner_shown = n_outer > 0;
     const double seconds = (double)(now - begin_ns) * 1e-9;
     char line[256];
     if (json_fd >= 0) {
@@ -119,14 +127,21 @@ void progress_begin(const char *name, int64_t n)
     if (!asked_environment)
         json_fd = fd_of_environment();
     asked_environment = true;
+    if (stage) {
+        assert(n_outer < MOST_OUTER);
+        outer[n_outer].stage = stage, outer[n_outer].total = total, outer[n_outer].begin_ns = begin_ns;
+        outer[n_outer++].done = atomic_load(&done);
+    }
     stage = name;
     total = n;
     begin_ns = now_ns();
     next_line_ns = next_line_ns ? next_line_ns : begin_ns + SILENCE_NS; // over all stages
     on_terminal = isatty(STDERR_FILENO);
     atomic_store(&done, 0);
-    atomic_store(&next_draw_ns, begin_ns + REDRAW_NS);
-    draw(begin_ns);
+    if (!n_outer) { // one within another is not worth a line yet
+        atomic_store(&next_draw_ns, begin_ns + REDRAW_NS);
+        draw(begin_ns);
+    }
     pthread_mutex_unlock(&lock);
 }
 
@@ -146,7 +161,13 @@ void progress_add(int64_t n)
 void progress_end(void)
 {
     pthread_mutex_lock(&lock);
-    if (stage) {
+    if (n_outer) {
+        n_outer--;
+        stage = outer[n_outer].stage, total = outer[n_outer].total, begin_ns = outer[n_outer].begin_ns;
+        atomic_store(&done, outer[n_outer].done);
+        if (inner_shown && (on_terminal || json_fd >= 0)) // what was said last is over
+            draw(now_ns());
+    } else if (stage) {
         if (on_terminal || json_fd >= 0)
             draw(now_ns());
         if (on_terminal)
