@@ -835,11 +835,11 @@ static void check_panorama(struct reader *r)
     struct config *c = r->config;
     struct panorama_config *p = &c->panorama;
     p->camera = CONFIG_NONE;
-    if (!(r->seen_sections >> PANORAMA & 1) || r->n_findings)
-        return;
     for (int i = 0; i < c->n_cameras; i++)
         if (!strcmp(c->camera[i].name, p->camera_name))
             p->camera = i;
+    if (!(r->seen_sections >> PANORAMA & 1) || r->n_findings)
+        return;
     if (p->camera == CONFIG_NONE)
         complain(r, r->panorama_line, "[panorama] camera = %s, but there is no [camera \"%s\"]; add it, or name another", p->camera_name, p->camera_name);
     else if (c->n_cameras == 1)

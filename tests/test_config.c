@@ -173,6 +173,16 @@ static void a_panorama_camera_is_known_by_its_section(void **state)
     config_free(&c);
 }
 
+// It needs no line of its own, and is not told to get one because something else is wrong.
+static void one_fault_is_not_told_as_two(void **state)
+{
+    (void)state;
+    struct config c;
+    assert_int_equal(parse(&c, "[rig]\ntakes = t\n[trigger]\nkind = gpio\nchip = c\n" A01 "full_line = 4\n" P01 PANORAMA), -EINVAL);
+    assert_non_null(strstr(said, "rigd.conf:2:"));
+    assert_null(strstr(said, "P01"));
+}
+
 static void a_line_without_half_press_may_be_held_for_all_of_its_limit(void **state)
 {
     (void)state;
@@ -332,6 +342,7 @@ int main(void)
         cmocka_unit_test(a_whole_configuration_is_read),
         cmocka_unit_test(each_fault_is_named_with_its_line_and_a_remedy),
         cmocka_unit_test(a_panorama_camera_is_known_by_its_section),
+        cmocka_unit_test(one_fault_is_not_told_as_two),
         cmocka_unit_test(a_line_without_half_press_may_be_held_for_all_of_its_limit),
         cmocka_unit_test(what_rigsim_lists_is_accepted_as_it_stands),
         cmocka_unit_test(the_lines_of_a_board_are_outputs_and_inputs),
