@@ -37,7 +37,6 @@ enum {
 struct shared { // with the guard
     _Atomic int64_t limit_ns[EDGES_WIRES_MAX];
     atomic_bool active;   // a shot is pending or a supply is cut
-    atomic_bool let_go;   // the guard had to
 };
 
 struct trigger_lines {
@@ -132,10 +131,8 @@ static void guard_run(struct trigger_lines *t, int guard_fd)
             else if (limit_ns)
                 active[w / 64] |= UINT64_C(1) << w % 64;
         }
-        if (over) {
+        if (over)
             t->ops->set(t->lines, active, all, now_ns);
-            atomic_store(&t->shared->let_go, true);
-        }
     }
     memset(active, 0, sizeof(active)); // rigd is gone
     t->ops->set(t->lines, active, all, clock_ns());
@@ -184,6 +181,12 @@ static void guard_alert(struct trigger_lines *t)
 
 // ---- outputs: under the lock ----------------------------------------------------------------------------------------------------
 
+// When nothing is active or planned any more, it may sleep.
+static void guard_may_sleep(struct trigger_lines *t)
+{
+    atomic_store(&t->shared->active, edges_next_ns(&t->edges) != EDGES_NEVER);
+}
+
 static void tell_loop(struct trigger_lines *t)
 {
     const uint64_t one = 1;
@@ -209,6 +212,7 @@ static void all_off(struct trigger_lines *t, bool relays)
     t->broken |= err != 0;
     if (t->broken)
         tell_loop(t);
+    guard_may_sleep(t);
 }
 
 static void line_failed(struct trigger_lines *t, int err)
@@ -243,7 +247,7 @@ static void carry_out(struct trigger_lines *t, int64_t at_ns)
             all_off(t, false);
         finish_shot(t, err || s.too_late || s.cut ? -EIO : 0);
     }
-    atomic_store(&t->shared->active, edges_next_ns(&t->edges) != EDGES_NEVER);
+    guard_may_sleep(t);
 }
 
 static void *run(void *arg)
@@ -412,6 +416,7 @@ int trigger_lines_relay(void *self, int camera, bool cut)
                 finish_shot(t, -EIO);
             err = -EIO;
         }
+        guard_may_sleep(t);
         pthread_cond_signal(&t->wake); // it may not stay cut for ever
     }
     pthread_mutex_unlock(&t->lock);

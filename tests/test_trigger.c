@@ -653,24 +653,74 @@ static void stopped_in_the_middle_the_guard_lets_go_at_the_limit(void **state)
     assert_int_equal(waitpid(pid, &status, 0), pid);
 }
 
+// Of the trigger that is open; 0: this kernel does not tell.
+static pid_t guard_process(void)
+{
+    char path[64], children[64] = "";
+    snprintf(path, sizeof(path), "/proc/self/task/%d/children", getpid());
+    FILE *f = fopen(path, "r");
+    if (!f || !fgets(children, sizeof(children), f))
+        fprintf(stderr, "# no %s here: the guard cannot be found\n", path);
+    if (f)
+        fclose(f);
+    return atoi(children);
+}
+
+static long n_sleeps(pid_t pid)
+{
+    char path[64], line[200];
+    long n = -1;
+    snprintf(path, sizeof(path), "/proc/%d/status", (int)pid);
+    FILE *f = fopen(path, "r");
+    while (f && fgets(line, sizeof(line), f))
+        sscanf(line, "voluntary_ctxt_switches: %ld", &n);
+    if (f)
+        fclose(f);
+    return n;
+}
+
+// It looks a hundred times a second while something is pressed or cut, and a rig stands idle for weeks.
+static void with_nothing_to_watch_the_guard_sleeps(void **state)
+{
+    (void)state;
+    for (int how = 0; how < 3; how++) {
+        struct trigger_lines *t = open_fake(2);
+        const pid_t guard = guard_process();
+        const struct trigger_shot shot = { .at_ns = clock_ns() + 10 * MS, .hold_ms = how ? 2500 : 10 };
+        if (how < 2) {
+            assert_int_equal(trigger_lines_fire(t, &shot), 0);
+            wait_for_sets(1);
+            if (how)
+                trigger_lines_release(t);
+            serve(t, &heard.n_fired, 1);
+        } else {
+            assert_int_equal(trigger_lines_relay(t, 0, true), 0);
+            assert_int_equal(trigger_lines_relay(t, 0, false), 0);
+        }
+        poll(NULL, 0, 50);
+        const long before = guard ? n_sleeps(guard) : 0;
+        poll(NULL, 0, 300);
+        const long n = guard ? n_sleeps(guard) - before : 0;
+        if (n > 3)
+            fail_msg("after %s: it woke %ld times in 300 ms", how == 0 ? "a shot" : how == 1 ? "a release" : "a supply was given back", n);
+        trigger_lines_close(t);
+    }
+}
+
 static void without_its_guard_nothing_is_pressed(void **state)
 {
     (void)state;
     struct trigger_lines *t = open_fake(2);
-    char path[64], children[64] = "";
-    snprintf(path, sizeof(path), "/proc/self/task/%d/children", getpid());
-    FILE *f = fopen(path, "r");
-    if (!f || !fgets(children, sizeof(children), f)) {
-        fprintf(stderr, "# no %s here: the guard cannot be found\n", path);
+    const pid_t guard = guard_process();
+    if (!guard) {
         trigger_lines_close(t);
         return;
     }
-    fclose(f);
     const struct trigger_shot shot = { .at_ns = clock_ns() + 10 * MS, .hold_ms = 2000 };
     assert_int_equal(trigger_lines_fire(t, &shot), 0);
     wait_for_sets(1);
     log_set_level(LOG_SILENT);
-    kill(atoi(children), SIGKILL);
+    kill(guard, SIGKILL);
     serve(t, &heard.n_broken, 1);
     log_set_level(LOG_INFO);
     assert_int_equal(heard.err, -EIO);
@@ -974,6 +1024,7 @@ int main(void)
         cmocka_unit_test(close_in_the_middle_opens_everything),
         cmocka_unit_test(killed_in_the_middle_the_guard_lets_go),
         cmocka_unit_test(stopped_in_the_middle_the_guard_lets_go_at_the_limit),
+        cmocka_unit_test(with_nothing_to_watch_the_guard_sleeps),
         cmocka_unit_test(without_its_guard_nothing_is_pressed),
         cmocka_unit_test(a_button_is_heard_once_however_it_bounces),
         cmocka_unit_test(a_sync_contact_is_heard_once_with_its_own_time),
