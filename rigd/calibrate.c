@@ -128,7 +128,7 @@ int lag_write(const char *path, const struct config *config, const char *const *
             continue;
         struct json *o = json_new_object();
         json_set_string(o, "camera", config->camera[i].name);
-        json_set_string(o, "serial", serial[i]);
+        json_set_string(o, "serial", serial[i][0] ? serial[i] : config->camera[i].serial); // one that is off says none
         json_set_number(o, "mean_ms", lag[i].mean_ms);
         json_set_number(o, "std_ms", lag[i].std_ms);
         json_set_number(o, "error_ms", lag[i].error_ms);

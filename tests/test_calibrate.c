@@ -108,6 +108,23 @@ static void a_shots_late_bodies_are_named(void **state)
     assert_int_equal(t.n_measured, 0);
 }
 
+// Who is off while the others are measured has said no serial number, and keeps the lag it had.
+static void a_body_that_is_off_keeps_its_lag(void **state)
+{
+    (void)state;
+    struct config_camera camera[2] = { { .name = "A01", .serial = "11" }, { .name = "A02", .serial = "22" } };
+    const struct config config = { .n_cameras = 2, .camera = camera };
+    const char *const serial[2] = { "11", "" };
+    const struct lag lag[2] = { { 97, 7, 2, 30, 0 }, { 117, 3, 1, 29, 1 } };
+    struct lag back[2];
+    char path[] = "/tmp/studiorig-test-XXXXXX";
+    close(mkstemp(path));
+    assert_int_equal(lag_write(path, &config, serial, lag, "2026-11-22T09:00:00Z"), 0);
+    assert_int_equal(lag_read(path, &config, back), 0);
+    assert_memory_equal(back, lag, sizeof(lag));
+    unlink(path);
+}
+
 static void lag_follows_the_body_not_its_place(void **state)
 {
     (void)state;
@@ -143,6 +160,7 @@ int main(void)
         cmocka_unit_test(too_few_shots_are_no_measurement),
         cmocka_unit_test(delays_bring_all_shutters_to_the_slowest),
         cmocka_unit_test(a_shots_late_bodies_are_named),
+        cmocka_unit_test(a_body_that_is_off_keeps_its_lag),
         cmocka_unit_test(lag_follows_the_body_not_its_place),
     };
     return cmocka_run_group_tests(tests, NULL, NULL);
