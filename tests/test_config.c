@@ -61,6 +61,7 @@ static void a_whole_configuration_is_read(void **state)
     assert_int_equal(c.trigger.full_line, 17);
     assert_int_equal(c.trigger.button_line, CONFIG_NONE);
     assert_true(c.clock_max_s == 2.5);
+    assert_true(c.lag_within_ms == .1); // unasked
     config_free(&c);
 }
 
