@@ -256,14 +256,20 @@ static bool is_fatal(const struct gphoto *g, int code, int64_t began_ns)
     return t == CAMERA_LOST || t == CAMERA_STALLED || t == CAMERA_BROKEN || t == CAMERA_BUSY;
 }
 
+// What a body says goes into journals and onto terminals: one line, and nothing that moves a cursor.
+static void make_plain(char *text)
+{
+    for (char *s = text; *s; s++)
+        if ((unsigned char)*s < ' ' || *s == 127)
+            *s = ' ';
+}
+
 static void on_words(GPContext *context, const char *text, void *arg)
 {
     struct gphoto *g = arg;
     (void)context;
     snprintf(g->said, sizeof(g->said), "%s", text);
-    for (char *s = g->said; *s; s++)
-        if ((unsigned char)*s < ' ')
-            *s = ' ';
+    make_plain(g->said);
 }
 
 static GPContextFeedback on_cancel(GPContext *context, void *arg)
@@ -572,6 +578,7 @@ static void widget_text(CameraWidget *w, char *out, size_t room)
     default:
         break;
     }
+    make_plain(out);
 }
 
 // One of the driver's settings by its name. 1 and *out (to be unreferenced), 0: the body does not have it now, < 0: trouble.

@@ -417,6 +417,27 @@ static void the_wrong_body_is_not_used(void **state)
     sim_stop(&s);
 }
 
+// What it says goes into journals and onto terminals.
+static void what_a_body_says_is_text_and_moves_no_cursor(void **state)
+{
+    (void)state;
+    static const char text[] = "base = generic\nmodel = Cam\033[2J\033[31mera\nfirmware = 1\b2\177\n";
+    struct sim s;
+    struct worker w;
+    scratch_write("rude", text, sizeof(text) - 1);
+    sim_start(&s, scratch_path("rude"), NULL);
+    unlink(scratch_path("rude"));
+    worker_start(&w);
+    const struct camera_event *e = done(&w, opening(&s, "generic"));
+    assert_non_null(strstr(e->facts.model, "era"));
+    for (const char *c = e->facts.model; *c; c++)
+        assert_true(*c >= ' ' && *c != 127);
+    for (const char *c = e->facts.firmware; *c; c++)
+        assert_true(*c >= ' ' && *c != 127);
+    worker_stop(&w);
+    sim_stop(&s);
+}
+
 static void what_a_body_does_not_take_is_told_not_hidden(void **state)
 {
     (void)state;
@@ -778,6 +799,7 @@ int main(void)
         cmocka_unit_test(a_frame_of_each_kind_comes_from_release_to_disk),
         cmocka_unit_test(a_lost_event_is_made_up_for_by_the_listing),
         cmocka_unit_test(the_wrong_body_is_not_used),
+        cmocka_unit_test(what_a_body_says_is_text_and_moves_no_cursor),
         cmocka_unit_test(what_a_body_does_not_take_is_told_not_hidden),
         cmocka_unit_test(a_body_shows_itself_and_works_on),
         cmocka_unit_test(a_flood_of_events_is_named_and_ends),
