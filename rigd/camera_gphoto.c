@@ -1337,12 +1337,13 @@ int gphoto_identify(struct gphoto *g, struct camera_event *e)
                 sleep_ms(20);
                 g->gone(g->arg);
             }
+            const int64_t ends = begin(g);
             gp_widget_set_value(w, &(int){ 0 });
-            gp_camera_set_single_config(g->camera, name, w, g->context);
+            const int off = gp_camera_set_single_config(g->camera, name, w, g->context);
+            gp_widget_unref(w);
+            return off < 0 && is_fatal(g, off, ends) ? failed(g, e, off, ends, "it does not end its live view") : 0;
         }
         gp_widget_unref(w);
-        if (code >= 0)
-            return 0;
         if (is_fatal(g, code, began))
             return failed(g, e, code, began, "cannot make it show itself");
     }

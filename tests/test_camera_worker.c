@@ -479,6 +479,20 @@ static void a_body_shows_itself_and_works_on(void **state)
     }
 }
 
+static void a_body_that_does_not_stop_showing_itself_is_told(void **state)
+{
+    (void)state;
+    struct sim s;
+    struct worker w;
+    sim_start(&s, "nikon", "* on op 0x9202 busy 1s\n");
+    worker_start(&w);
+    done(&w, opening(&s, "nikon"));
+    fails(&w, (struct camera_command){ .kind = CAMERA_IDENTIFY, .timeout_ms = 1000 }, CAMERA_BUSY);
+    assert_non_null(strstr(w.answer.text, "live view"));
+    worker_stop(&w);
+    sim_stop(&s);
+}
+
 static void a_flood_of_events_is_named_and_ends(void **state)
 {
     (void)state;
@@ -802,6 +816,7 @@ int main(void)
         cmocka_unit_test(what_a_body_says_is_text_and_moves_no_cursor),
         cmocka_unit_test(what_a_body_does_not_take_is_told_not_hidden),
         cmocka_unit_test(a_body_shows_itself_and_works_on),
+        cmocka_unit_test(a_body_that_does_not_stop_showing_itself_is_told),
         cmocka_unit_test(a_flood_of_events_is_named_and_ends),
         cmocka_unit_test(a_busy_body_is_busy_and_not_bare_of_settings),
         cmocka_unit_test(a_full_card_is_the_card),
