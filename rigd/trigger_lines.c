@@ -217,9 +217,9 @@ static void all_off(struct trigger_lines *t, bool relays)
 
 static void line_failed(struct trigger_lines *t, int err)
 {
-    log_error("trigger: a line failed: %s: all are released, the trigger is opened anew", strerror(-err));
     t->broken = true;
-    all_off(t, true);
+    all_off(t, true); // before a word about it: a journal may take its time
+    log_error("trigger: a line failed: %s: all are released, the trigger is opened anew", strerror(-err));
 }
 
 // Carry out one step of the plan. at_ns: when it counts as done.
@@ -236,17 +236,17 @@ static void carry_out(struct trigger_lines *t, int64_t at_ns)
     }
     if (err)
         line_failed(t, err);
+    if (pending && (err || s.done || s.cut)) {
+        if (s.cut && !err)
+            all_off(t, false);
+        finish_shot(t, err || s.too_late || s.cut ? -EIO : 0);
+    }
     if (s.too_late)
         log_error("trigger: this process did not run when the shutters were due; they are not pressed %lld ms late",
             (long long)(EDGES_LATE_MAX_NS / 1000000));
     if (s.cut)
         log_error("trigger: a line was held to its limit of %u ms and let go by the guard: this process did not run",
             t->config->trigger.max_hold_ms);
-    if (pending && (err || s.done || s.cut)) {
-        if (s.cut && !err)
-            all_off(t, false);
-        finish_shot(t, err || s.too_late || s.cut ? -EIO : 0);
-    }
     guard_may_sleep(t);
 }
 

@@ -548,10 +548,21 @@ static void release_in_the_middle_opens_everything_and_says_so_once(void **state
     trigger_lines_close(t);
 }
 
+static int n_active_when_told;
+
+static void look_when_told(void *arg, enum log_level level, const char *message)
+{
+    (void)arg, (void)message;
+    if (level >= LOG_WARNING)
+        n_active_when_told += n_active(chip->n_sets - 1);
+}
+
 static void a_line_that_breaks_in_the_middle_releases_all_and_tells_once(void **state)
 {
     (void)state;
     log_set_level(LOG_SILENT);
+    log_set_hook(look_when_told, NULL);
+    n_active_when_told = 0;
     for (int failing = 1; failing <= 3; failing++) { // half, full, release
         struct trigger_lines *t = open_fake(4);
         chip->failing = failing;
@@ -570,7 +581,9 @@ static void a_line_that_breaks_in_the_middle_releases_all_and_tells_once(void **
         assert_int_equal(heard.n_fired, 1);
         trigger_lines_close(t);
     }
+    log_set_hook(NULL, NULL);
     log_set_level(LOG_INFO);
+    assert_int_equal(n_active_when_told, 0); // a journal may take its time: first the lines, then the words
 }
 
 static void a_chip_that_is_gone_is_told(void **state)
