@@ -51,6 +51,7 @@ struct trigger_lines {
     pthread_t thread;
     bool locks, started, quit;
     bool broken, told_broken; // lines or guard are gone
+    bool told_stuck;          // they could not be released
     bool has_fired;           // fired() is due
     int result;
     int64_t pressed_ns, late_ns;
@@ -201,25 +202,27 @@ static void finish_shot(struct trigger_lines *t, int err)
     tell_loop(t);
 }
 
-// Everything off, whatever was said before.
-static void all_off(struct trigger_lines *t, bool relays)
+// Everything off, whatever was said before. 0, or -errno: something may still be pressed (logged).
+static int all_off(struct trigger_lines *t, bool relays)
 {
     struct edges_step s;
     edges_give_up(&t->edges, relays, &s);
     const int err = t->ops->set(t->lines, s.active, s.changed, clock_ns());
-    if (err && !t->broken)
-        log_error("trigger: cannot release the lines: %s: look at the wiring", strerror(-err));
+    if (err && !t->told_stuck)
+        log_error("trigger: cannot release the lines: %s: shutters may still be pressed: unplug them, then look at the wiring", strerror(-err));
+    t->told_stuck |= err != 0;
     t->broken |= err != 0;
     if (t->broken)
         tell_loop(t);
     guard_may_sleep(t);
+    return err;
 }
 
 static void line_failed(struct trigger_lines *t, int err)
 {
     t->broken = true;
-    all_off(t, true); // before a word about it: a journal may take its time
-    log_error("trigger: a line failed: %s: all are released, the trigger is opened anew", strerror(-err));
+    if (!all_off(t, true)) // before a word about it: a journal may take its time
+        log_error("trigger: a line failed: %s: all are released, the trigger is opened anew", strerror(-err));
 }
 
 // Carry out one step of the plan. at_ns: when it counts as done.

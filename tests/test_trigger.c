@@ -334,7 +334,7 @@ static void a_supply_comes_back_however_often_it_is_cut(void **state)
 enum { SETS_MAX = 4000 };
 
 struct fake_chip { // shared with forked processes
-    atomic_int n_sets, failing; // failing: that set() fails, counted from 1; 0: none
+    atomic_int n_sets, failing, failing_from; // that set() fails, counted from 1; from that one on; 0: none
     atomic_int level[CONFIG_CAMERAS_MAX + 1];
     struct { uint64_t active[LINES_WORDS], changed[LINES_WORDS]; int64_t at_ns; pid_t by; } set[SETS_MAX];
     int edges[2];                 // socketpair of struct lines_edge
@@ -362,7 +362,7 @@ static int fake_set(void *self, const uint64_t *active, const uint64_t *changed,
     memcpy(c->set[i].changed, changed, sizeof(c->set[i].changed));
     c->set[i].at_ns = clock_ns();
     c->set[i].by = getpid();
-    return i + 1 == c->failing ? -ENODEV : 0;
+    return i + 1 == c->failing || (c->failing_from && i + 1 >= c->failing_from) ? -ENODEV : 0;
 }
 
 static int fake_fd(const void *self)
@@ -584,6 +584,37 @@ static void a_line_that_breaks_in_the_middle_releases_all_and_tells_once(void **
     log_set_hook(NULL, NULL);
     log_set_level(LOG_INFO);
     assert_int_equal(n_active_when_told, 0); // a journal may take its time: first the lines, then the words
+}
+
+static char told[2000];
+
+static void keep_told(void *arg, enum log_level level, const char *message)
+{
+    const size_t n = strlen(told);
+    (void)arg;
+    if (level >= LOG_WARNING)
+        snprintf(told + n, sizeof(told) - n, "%s\n", message);
+}
+
+static void lines_that_cannot_be_released_are_not_said_to_be(void **state)
+{
+    (void)state;
+    struct trigger_lines *t = open_fake(2);
+    const struct trigger_shot shot = { .at_ns = clock_ns() + 50 * MS, .hold_ms = 10 };
+    chip->failing_from = 2; // from the release on
+    told[0] = 0;
+    log_set_level(LOG_SILENT);
+    log_set_hook(keep_told, NULL);
+    assert_int_equal(trigger_lines_fire(t, &shot), 0);
+    serve(t, &heard.n_broken, 1);
+    trigger_lines_close(t);
+    log_set_hook(NULL, NULL);
+    log_set_level(LOG_INFO);
+    assert_int_equal(heard.err, -EIO);
+    assert_null(strstr(told, "all are released"));
+    const char *stuck = strstr(told, "may still be pressed");
+    assert_non_null(stuck);
+    assert_null(strstr(stuck + 1, "may still be pressed")); // once
 }
 
 static void a_chip_that_is_gone_is_told(void **state)
@@ -1033,6 +1064,7 @@ int main(void)
         cmocka_unit_test(one_shot_is_three_calls_to_the_chip),
         cmocka_unit_test(release_in_the_middle_opens_everything_and_says_so_once),
         cmocka_unit_test(a_line_that_breaks_in_the_middle_releases_all_and_tells_once),
+        cmocka_unit_test(lines_that_cannot_be_released_are_not_said_to_be),
         cmocka_unit_test(a_chip_that_is_gone_is_told),
         cmocka_unit_test(close_in_the_middle_opens_everything),
         cmocka_unit_test(killed_in_the_middle_the_guard_lets_go),
