@@ -47,6 +47,7 @@ struct arguments {
 };
 
 static const char *const demosaic_names[] = { [DEMOSAIC_HALF] = "half", [DEMOSAIC_BILINEAR] = "bilinear", [DEMOSAIC_AHD] = "ahd" };
+static const char *const spread_px[] = { [DEMOSAIC_HALF] = "0", [DEMOSAIC_BILINEAR] = "1", [DEMOSAIC_AHD] = "3" };
 
 // ---- command line ------------------------------------------------------------------------------------------------------------
 
@@ -349,7 +350,7 @@ static int say_what_is_made(struct job *j)
     err = j->flat_path ? hash_of(j->flat_path, flat_xxh128) : 0;
     if (err)
         return fail(j, err, "flat field %s: %s", j->flat_path, strerror(-err));
-    snprintf(j->made, sizeof(j->made), "rigd-develop " STUDIORIG_VERSION " LibRaw %s raw %s %s%s scale %.9g reference %.9g,%.9g,%.9g gain %.9g,%.9g,%.9g flat %s saturation %g",
+    snprintf(j->made, sizeof(j->made), "rigd-develop " STUDIORIG_VERSION " 2 LibRaw %s raw %s %s%s scale %.9g reference %.9g,%.9g,%.9g gain %.9g,%.9g,%.9g flat %s saturation %g",
              raw_library(), j->raw_xxh128, demosaic_names[a->demosaic], a->tiff ? " tiff" : "", j->scale, a->reference.time_s, a->reference.f_number, a->reference.iso, j->gain[0],
              j->gain[1], j->gain[2], flat_xxh128, a->saturation);
     json_set_string(j->result, "xxh128", j->raw_xxh128);
@@ -484,6 +485,7 @@ static int write_exr(struct job *j)
     const struct image_note notes[] = {
         { "studiorig.made", j->made, 0 },
         { "studiorig.develop", note, 0 },
+        { IMAGE_SPREAD_NOTE, spread_px[j->a.demosaic], 0 }, // what a solver keeps away from edges
         { "cameraMake", f->make, 0 },
         { "cameraModel", f->model, 0 },
         { "cameraSerialNumber", f->serial, 0 },

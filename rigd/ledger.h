@@ -42,7 +42,7 @@ enum ledger_processing {
 };
 enum { LEDGER_NOTES_MAX = 12, LEDGER_NOTE_BYTES = 240, LEDGER_SOLVES_MAX = 3 };
 
-// One stage of a take's time line: button (press to shutters), exposed, collected, verified, then the steps of processing.h by name.
+// One stage of a take's time line: button (press to shutters), exposed, thumbnails (all there), collected, verified, then the steps of processing.h by name.
 struct ledger_stage {
     char name[16];
     int64_t began_utc_ms, ended_utc_ms;

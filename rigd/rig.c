@@ -303,7 +303,7 @@ void rig_new_ledger(struct rig *r)
     r->change = r->durable = r->covered = 0;
     r->n_commit_failures = r->n_fire_tries = 0;
     r->commit_retry_ns = 0;
-    r->shot_ns = 0;
+    r->shot_ns = r->thumbed_ns = 0;
     r->outcome[0] = 0;
     r->cancelled = false;
 }

@@ -145,6 +145,7 @@ static void done(struct rig *r, int i, int64_t now, const struct camera_event *e
         break;
     case CAMERA_THUMBNAIL:
         b->thumbed = true;
+        r->thumbed_ns = now;
         break;
     case CAMERA_FETCH:
         if (!c || k < 0 || k >= c->n_objects || b->step != STEP_COPY)

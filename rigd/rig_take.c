@@ -378,6 +378,8 @@ static void draw_time_line(struct rig *r, int64_t now)
         }
     ledger_note_stage(l, "button", r->utc_ms, pressed_ms);
     ledger_note_stage(l, "exposed", pressed_ms, exposed_ms);
+    if (r->thumbed_ns)
+        ledger_note_stage(l, "thumbnails", exposed_ms, utc_at(r, r->thumbed_ns));
     ledger_note_stage(l, "collected", exposed_ms, collected_ms);
     ledger_note_stage(l, "verified", collected_ms, utc_at(r, now));
 }

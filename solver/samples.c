@@ -20,6 +20,7 @@
 #include <stdbool.h>
 #include <stdlib.h>
 #include <string.h>
+#include <strings.h>
 
 enum { CHUNK_TEXELS = 256, CHUNK_ROWS = 4, MAX_FOOTPRINT_PX = 8, MAX_VIEWS = UINT16_MAX + 1 };
 
@@ -33,7 +34,7 @@ static const double GRADIENT_STEP_PX = .5;
 struct samples_settings samples_defaults(void)
 {
     return (struct samples_settings){
-        .grazing_cos = MASK_GRAZING_COS_PERCENT / 100., .erode_px = 1, .at_centre = true, .white = 1};
+        .grazing_cos = MASK_GRAZING_COS_PERCENT / 100., .erode_px = ERODE_BY_PICTURE, .at_centre = true, .white = 1};
 }
 
 // ---- where a texel lies in a view -----------------------------------------------------------
@@ -109,6 +110,7 @@ struct view_job {
     const struct camera *camera; // of the picture's size
     const struct image *image;
     int rgb[3], clip;        // channels; clip: -1 if there is none
+    int erode_px;            // of this picture
     uint8_t *mask;           // [n texels] MASK_VISIBLE: has a sample; others are left out
     _Atomic uint8_t *wanted; // [height][width] pixels whose ray is asked for
     float (*seen_m)[3];      // [height][width] what it hits; NaN: nothing
@@ -123,7 +125,7 @@ struct pixel_range {
 // The pixels that must see the texel's own surface: those it reads and erode_px around them.
 static struct pixel_range pixels_around(const struct view_job *job, const struct footprint *f)
 {
-    const int e = job->settings->erode_px;
+    const int e = job->erode_px;
     return (struct pixel_range){
         f->x0 > e ? f->x0 - e : 0,
         job->camera->width_px - f->x1 > e ? f->x1 + e : job->camera->width_px,
@@ -302,7 +304,7 @@ static void read_texels(void *arg, int64_t begin, int64_t end, int worker)
         const double step = GRADIENT_STEP_PX;
         const double across = luminance_at(job, &f, step, 0) - luminance_at(job, &f, -step, 0),
                      down = luminance_at(job, &f, 0, step) - luminance_at(job, &f, 0, -step);
-        if (job->settings->at_centre && job->settings->erode_px > 0)
+        if (job->settings->at_centre && job->erode_px > 0)
             value_at_centre(rgb, job, &f);
         else
             mean_over(rgb, job, &f, 0, 0);
@@ -340,6 +342,21 @@ static int find_channels(struct view_job *job, const struct image *image, const 
     return image_require_finite(image, read, path);
 }
 
+// Light from beyond an edge is in a demosaiced picture's pixels well inside of it. That is not noise: it says the same in every view
+// that the edge is in, and moves lights.
+static int erode_of(const char *path)
+{
+    enum { ROOM = 12, AHD_PX = 3, MOST_PX = 16 };
+    char text[ROOM], *end;
+    const char *dot = strrchr(path, '.');
+    if (!image_read_note(path, IMAGE_SPREAD_NOTE, text, sizeof(text))) {
+        const long px = strtol(text, &end, 10);
+        if (end != text && !*end)
+            return 1 + (px < 0 ? 0 : px > MOST_PX ? MOST_PX : (int)px);
+    }
+    return dot && (!strcasecmp(dot, ".tif") || !strcasecmp(dot, ".tiff")) ? 1 + AHD_PX : 1;
+}
+
 // Marks the texels that have a sample in job->mask and fills their value and flags.
 static int gather_view(struct view_job *job, const struct camera *calibrated, const char *path)
 {
@@ -349,6 +366,7 @@ static int gather_view(struct view_job *job, const struct camera *calibrated, co
     if (err)
         return err;
     job->camera = &camera, job->image = &image;
+    job->erode_px = job->settings->erode_px == ERODE_BY_PICTURE ? erode_of(path) : job->settings->erode_px;
     err = find_channels(job, &image, path);
     if (err)
         goto done;
@@ -460,7 +478,7 @@ int samples_gather(struct samples *out, const struct texels *t, const struct ray
                    const struct cameras *cameras, const char *const *image_paths,
                    const struct samples_settings *settings)
 {
-    assert(settings->erode_px >= 0);
+    assert(settings->erode_px >= ERODE_BY_PICTURE);
     memset(out, 0, sizeof(*out));
     if (cameras->n > MAX_VIEWS) {
         log_error("samples: %d views; at most %d are taken", cameras->n, MAX_VIEWS);

@@ -14,6 +14,8 @@ enum sample_flags {
     SAMPLE_CLIPPED = 1, // a pixel under it was at or above white: the radiance is a lower bound
 };
 
+enum { ERODE_BY_PICTURE = -1 };
+
 struct samples {
     int n_texels, n_views;
     int64_t n;
@@ -30,10 +32,12 @@ struct samples {
 
 struct samples_settings {
     double grazing_cos; // samples below are left out; .15 (SOLVER.md 2)
-    int erode_px;       // samples this near (in pixels) to a silhouette or depth edge are left out; 1. Counted from the pixels a
-                        // sample reads: 1 makes sure that no pixel that is read lies on the edge itself; 0 looks at their centres only
+    int erode_px;       // samples this near (in pixels) to a silhouette or depth edge are left out. Counted from the pixels a
+                        // sample reads: 1 makes sure that no pixel that is read lies on the edge itself; 0 looks at their centres only.
+                        // ERODE_BY_PICTURE (the default): 1 and as far as the picture's making has spread light from pixel to pixel (its
+                        // note IMAGE_SPREAD_NOTE; a TIFF without one is taken for a photograph developed by AHD: 3)
     bool at_centre;     // take off what slope and curvature of the picture add to the mean over a footprint, as from a pixel around it
-                        // (which erode_px >= 1 makes sure is the same surface): the radiance at the texel's centre, to second order; true
+                        // (which erode_px other than 0 makes sure is the same surface): the radiance at the texel's centre, to second order; true
     double white;       // clip level where an image has no "clip" channel; 1.0; 0: never
     int n_threads;
 };

@@ -264,7 +264,7 @@ if [ "$n_cameras" -gt 0 ]; then use_rig; else no_rig; fi
 # ---- how good is it -----------------------------------------------------------------------------------------------------------
 step "judged: the solved material as the cameras see it that were set aside, beside their pictures; then under lights that the solve has never seen"
 mkdir "$out/aside" # cameras of views that the solver did not fit
-cp "$cameras"/cameras.txt "$cameras"/points3D.txt "$out/aside/"
+cp "$cameras"/*.txt "$out/aside/"
 tr -d ' \n"' <"$solve/report.json" | sed -n 's/.*views_held_out:\[\([^]]*\)\].*/\1/p' | tr ',' '\n' | sed 's/\.exr$//' >"$out/views-all-aside"
 awk '{ v[NR] = $0 } END { n = NR < 6 ? NR : 6; for (i = 0; i < n; i++) print v[int(i * NR / n) + 1] }' "$out/views-all-aside" >"$out/views-aside" # six are pictures enough
 awk 'FNR == NR { is_aside[$1] = 1; next } /^#/ { next } points { points = 0; if (keep) print ""; next }
@@ -286,7 +286,7 @@ figure() { sed -n '$s/.*RMSE  *\([0-9.]* %\)  *PSNR  *\([0-9.]* dB\).*/\1 (\2)/p
     printf 'views set aside, where texels are      RMSE %.3f %%   (fitted views %.3f %%)\n' "$(number "$solve/report.json" rmse_held_out_percent)" "$(number "$solve/report.json" rmse_fit_percent)"
     printf '%s of them, whole object with its edges RMSE %s\n' "$(wc -l <"$out/views-aside")" "$(figure "$out/compare.txt")"
 } >"$out/figures.txt"
-if [ -f "$studio/relit/probe.json" ]; then
+if [ -f "$studio/relit/probe.json" ] && [ -d "$studio/relit/linear" ]; then
     panels=$studio/relit/panels.json
     [ -f "$panels" ] || panels=$studio/relit/lights.json
     "$rigsolve" render "$solve" --cameras "$studio/relit/cameras" --panorama "$studio/relit/panorama.exr" --world-from-probe "$studio/relit/probe.json" --panels "$panels" -n 512 \

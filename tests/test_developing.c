@@ -312,6 +312,8 @@ static void the_picture_carries_its_exposure(void **state)
     assert_string_equal(note, "10001");
     assert_int_equal(image_read_note(scratch_path("a.exr"), "capDate", note, sizeof(note)), 0);
     assert_string_equal(note, "2023:11:14 22:13:20");
+    assert_int_equal(image_read_note(scratch_path("a.exr"), IMAGE_SPREAD_NOTE, note, sizeof(note)), 0);
+    assert_string_equal(note, "0");
     assert_int_equal(image_read_note(scratch_path("a.exr"), "studiorig.develop", note, sizeof(note)), 0);
     assert_int_equal(json_parse(&o, note, strlen(note), "the note"), 0);
     assert_true(number(o, "exposure.0") == 1. / 64);

@@ -140,7 +140,7 @@ check "outcome of both solves, and why not to trust them" sh -c "grep -q '\"name
 check "a contact sheet of what the cameras showed" sh -c "test -s $D/takes/$take/sheet/thumbnails.png && grep -q '\"camera\": \"A03\"' $D/takes/$take/sheet/thumbnails.json"
 check "rigctl report names the pages" sh -c "$BIN/rigctl report $take | grep -q 'page: .*/solve/preview/report.html'"
 check "and the time line: from the button on, in order, each stage ends after it began" sh -c "$BIN/rigctl report $take | awk '\$5 == \"took\" { line = line \" \" \$1; if (\$4 < \$2 || \$2 < 0) bad = 1; if (\$1 == \"button\" && \$2 > 0) bad = 1; ended[\$1] = \$4 }
-    END { print line; exit bad || line !~ /button exposed collected verified / || !ended[\"sheet\"] || !ended[\"develop\"] || !ended[\"preview\"] || !ended[\"standard\"] || ended[\"preview\"] < ended[\"develop\"] || ended[\"standard\"] < ended[\"preview\"] || ended[\"standard\"] > 600 }'"
+    END { print line; exit bad || line !~ /button exposed thumbnails collected verified / || !ended[\"sheet\"] || !ended[\"develop\"] || !ended[\"preview\"] || !ended[\"standard\"] || ended[\"preview\"] < ended[\"develop\"] || ended[\"standard\"] < ended[\"preview\"] || ended[\"standard\"] > 600 }'"
 check "which take.json keeps" sh -c "grep -q '\"time_line\":\[{\"stage\":\"button\",\"began_utc_ms\":[0-9]' $D/takes/$take/take.json"
 check "rigctl preview answers with the model" sh -c "$BIN/rigctl preview $take | grep -q 'solve/preview/model.glb'; grep -c . $D/fake/calls"
 before=$(wc -l <"$D/fake/calls")

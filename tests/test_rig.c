@@ -18,6 +18,11 @@ static void two_hundred_cameras_deliver_every_frame(void **state)
     assert_int_equal(l->n_measured, 200);
     assert_string_equal(l->camera[7].object[0].file, "raw/A07.nef");
     assert_int_equal(w.n_kills, 0);
+    static const char *const stages[] = { "button", "exposed", "thumbnails", "collected", "verified" };
+    assert_int_equal(l->n_stages, 5);
+    for (int i = 0; i < 5; i++)
+        assert_string_equal(l->stage[i].name, stages[i]);
+    assert_true(l->stage[2].ended_utc_ms > l->stage[1].ended_utc_ms && l->stage[2].ended_utc_ms < l->stage[3].ended_utc_ms); // pictures to look at come first
     tear_down();
 }
 

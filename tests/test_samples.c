@@ -594,6 +594,81 @@ static void samples_near_edges_of_what_the_camera_sees_are_left_out_and_no_other
     }
 }
 
+// A developed picture: every pixel is the mean of all within spread_px, and says so, or not.
+struct developed {
+    const struct image *from;
+    int spread_px;
+};
+
+static int developed_row(void *arg, int y, float *row)
+{
+    const struct developed *d = arg;
+    for (int x = 0; x < d->from->width; x++)
+        for (int c = 0; c < 3; c++) {
+            int n = 0;
+            row[3 * x + c] = 0;
+            for (int j = y - d->spread_px; j <= y + d->spread_px; j++)
+                for (int i = x - d->spread_px; i <= x + d->spread_px; i++)
+                    if (i >= 0 && j >= 0 && i < d->from->width && j < d->from->height) {
+                        row[3 * x + c] += d->from->data[(j * d->from->width + i) * 3 + c];
+                        n++;
+                    }
+            row[3 * x + c] /= (float)n;
+        }
+    return 0;
+}
+
+static int64_t count_mixed(const struct samples *got, const struct scene *s)
+{
+    int64_t n = 0;
+    for (int t = 0; t < got->n_texels; t++)
+        for (int64_t i = got->first[t]; i < got->first[t + 1]; i++) {
+            float rgb[3];
+            samples_radiance(got, i, rgb);
+            n += fabs((double)rgb[0] - (s->texels.position_m[t][2] > .2f ? 2 : 1)) > 1e-3;
+        }
+    return n;
+}
+
+static void what_developing_spread_over_an_edge_is_left_out(void **state)
+{
+    (void)state;
+    static const char *const names[] = {"R", "G", "B"};
+    const struct { const char *note; int spread_px; bool is_tiff; } cases[] = {
+        {"3", 3, false}, {"0", 0, false}, {NULL, 0, false}, {NULL, 3, true}, {NULL, 3, false}, {"many", 0, false}, {"-5", 0, false},
+    };
+    int64_t n_of_spread[4] = {0};
+    for (size_t k = 0; k < sizeof(cases) / sizeof(cases[0]); k++) {
+        struct scene s;
+        struct samples got;
+        scene_open(&s, ray_mesh_disc_above_floor(.4, .5, 400), 128);
+        add_view(&s, 120, 80, 90, (const double[3]){.5, -.9, 2}, (const double[3]){0});
+        struct image sharp = paint(&s, 0, 120, 80, false, paint_disc_and_floor);
+        struct developed d = {&sharp, cases[k].spread_px};
+        const struct image_note note = {IMAGE_SPREAD_NOTE, cases[k].note, 0};
+        const struct image_rows rows = {120, 80, 3, names, developed_row, &d};
+        if (cases[k].is_tiff) // by its name: what is in it is told by content
+            strcpy(strrchr(s.path[0], '.'), ".TIF");
+        assert_int_equal(image_write_exr_rows(&rows, &note, cases[k].note != NULL, s.path[0], IMAGE_FLOAT, IMAGE_ZIP), 0);
+        assert_int_equal(gather(&got, &s), 0);
+        const bool is_known = cases[k].note || cases[k].is_tiff || !cases[k].spread_px;
+        const int64_t n_mixed = count_mixed(&got, &s);
+        fprintf(stderr, "# spread %d px, note %s%s: %lld samples, %lld mixed\n", cases[k].spread_px, cases[k].note ? cases[k].note : "-",
+                cases[k].is_tiff ? ", TIFF" : "", (long long)got.n, (long long)n_mixed);
+        assert_true(is_known ? !n_mixed : n_mixed > 100);
+        if (is_known && n_of_spread[cases[k].spread_px])
+            assert_int_equal(got.n, n_of_spread[cases[k].spread_px]);
+        if (is_known)
+            n_of_spread[cases[k].spread_px] = got.n;
+        image_free(&sharp);
+        samples_free(&got);
+        unlink(s.path[0]);
+        strcpy(strrchr(s.path[0], '.'), ".exr");
+        scene_close(&s);
+    }
+    assert_true(n_of_spread[3] < n_of_spread[0] && n_of_spread[3] > n_of_spread[0] / 2);
+}
+
 // ---- who has samples ----
 
 struct brute {
@@ -1133,6 +1208,7 @@ int main(void)
         cmocka_unit_test(a_bright_pixel_is_found_where_it_is),
         cmocka_unit_test(a_texel_larger_than_a_pixel_is_the_mean_over_its_projection),
         cmocka_unit_test(samples_near_edges_of_what_the_camera_sees_are_left_out_and_no_others),
+        cmocka_unit_test(what_developing_spread_over_an_edge_is_left_out),
         cmocka_unit_test(every_texel_has_the_samples_that_brute_force_finds_in_order_of_views),
         cmocka_unit_test(a_view_direction_points_from_texel_to_camera),
         cmocka_unit_test(any_number_of_threads_gathers_the_same_bytes),

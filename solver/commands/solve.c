@@ -31,7 +31,7 @@ struct settings {
     struct solve_materials materials;
     double w_sim;
     bool has_w_sim, no_visibility, no_planes, no_continuation, footprint_mean, json;
-    int texture, n_lights, n_sub, n_threads;
+    int texture, n_lights, n_sub, n_threads, edge_px;
     uint64_t seed;
     struct inputs in;
 };
@@ -39,7 +39,7 @@ struct settings {
 enum {
     OPTION_PRESET = 512, OPTION_METHOD,
     OPTION_TEXTURE, OPTION_LIGHTS, OPTION_SUB_LIGHTS, OPTION_HOLD_OUT, OPTION_THREADS, OPTION_SEED, OPTION_JSON,
-    OPTION_REFLECTANCE, OPTION_ALBEDO, OPTION_DISTANCE, OPTION_W_SIM, OPTION_NO_PLANES, OPTION_NO_CONTINUATION, OPTION_FOOTPRINT_MEAN, OPTION_NO_VISIBILITY, OPTION_ROBUST, OPTION_GAIN,
+    OPTION_REFLECTANCE, OPTION_ALBEDO, OPTION_DISTANCE, OPTION_W_SIM, OPTION_NO_PLANES, OPTION_NO_CONTINUATION, OPTION_FOOTPRINT_MEAN, OPTION_EDGE_PX, OPTION_NO_VISIBILITY, OPTION_ROBUST, OPTION_GAIN,
     OPTION_VERBOSE,
 };
 
@@ -55,6 +55,8 @@ static const struct argp_option options[] = {
     { "distance", OPTION_DISTANCE, "M", 0, "first distance of all lights (joint: swept; alternating: 2)", 2 },
     { "w-sim", OPTION_W_SIM, "W", 0, "weight of the similarity term beside the mean of squares: alternating 3e-9; joint: the last one "
       "(default: chosen by views set aside)", 2 },
+    { "edge-px", OPTION_EDGE_PX, "N", 0, "leave out samples within N pixels of a silhouette or depth edge (1, and as far as developing "
+      "has spread light, if the picture says so; 4 in a TIFF)", 2 },
     { "footprint-mean", OPTION_FOOTPRINT_MEAN, 0, 0, "a sample is the mean over its footprint, not the value at its centre", 2 },
     { "no-continuation", OPTION_NO_CONTINUATION, 0, 0, "joint: begin at --w-sim itself", 2 },
     { "no-planes", OPTION_NO_PLANES, 0, 0, "joint: do not look for lights that lie on one plane", 2 },
@@ -126,6 +128,9 @@ static error_t parse_option(int key, char *text, struct argp_state *state)
         return 0;
     case OPTION_FOOTPRINT_MEAN:
         s->footprint_mean = true;
+        return 0;
+    case OPTION_EDGE_PX:
+        s->edge_px = (int)argument_integer(state, "--edge-px", text, 0, 64);
         return 0;
     case OPTION_NO_PLANES:
         s->no_planes = true;
@@ -227,6 +232,7 @@ static int load(struct scene *scene, struct settings *s)
     struct lights cut = { 0 };
     gather.n_threads = s->n_threads;
     gather.at_centre = !s->footprint_mean;
+    gather.erode_px = s->edge_px;
     s->in.needs = TAKE_MESH | TAKE_CAMERAS | TAKE_PANORAMA | TAKE_VIEWS;
     s->in.texture = s->texture;
     int err = inputs_load(&s->in);
@@ -432,7 +438,7 @@ int command_solve(int argc, char **argv)
     const struct argp_child children[] = { { &inputs_argp, 0, NULL, 0 }, { &solve_materials_argp, 0, NULL, 0 }, { 0 } };
     const struct argp argp = { options, parse_option, "TAKE -o DIR\n--mesh M --cameras C --images DIR --panorama P -o DIR", doc,
                                children, 0, 0 };
-    struct settings s = { .preset = &presets[PRESET_STANDARD], .hold_out = "every:7", .seed = 1 };
+    struct settings s = { .preset = &presets[PRESET_STANDARD], .hold_out = "every:7", .seed = 1, .edge_px = ERODE_BY_PICTURE };
     struct scene scene = { 0 };
     struct joint_result result = { 0 };
     struct materials materials = { 0 };

@@ -5,7 +5,7 @@
 #   sh tests/bench/picture.sh build/demo ../shared/data/studio-pebble A08 relit03 tests/results/demo.png
 set -eu
 demo=${1:?usage: picture.sh DEMO STUDIO VIEW RELIT OUT.png} studio=$2 view=$3 relit=$4 out=$5 bin=${BIN:-build/bin}
-take=$(ls -d "$demo"/takes/*_demo | tail -n 1)
+take=$(ls -d "$demo"/takes/*/solve/standard | tail -n 1) take=${take%/solve/standard}
 solve=$take/solve/standard
 work=$(mktemp -d)
 trap 'rm -rf "$work"' EXIT

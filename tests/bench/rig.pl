@@ -417,7 +417,7 @@ sub scale {
     $r = new_rig(cameras => 85, raw => '2448x1632', rig => "raw_mb = 9\nfree_space_mb = 100\n");
     start_rigd($r);
     ready($r) or die "85 cameras do not come up\n";
-    my (@take_s, @cp_s, @collect_s, @sim_cpu_s, @rig_cpu_s, $bytes);
+    my (@take_s, @cp_s, @collect_s, @thumbs_s, @sim_cpu_s, @rig_cpu_s, $bytes);
     for my $turn (0 .. 3) { # the first warms up
         system('sync');
         my @pids = ([$r->{sim}], [$r->{rigd}, workers($r)]);
@@ -429,17 +429,21 @@ sub scale {
         die "take failed: $a->{result}{reason}\n" if !$a->{ok} || $a->{result}{state} ne 'verified';
         $bytes = $a->{result}{bytes};
         my $id = $a->{result}{id};
-        my $collect_s = 1e-3 * max(map { $_->{files}[0]{copied_ms} } @{report($r, $id)->{cameras}});
+        my $account = report($r, $id);
+        my $collect_s = 1e-3 * max(map { $_->{files}[0]{copied_ms} } @{$account->{cameras}});
+        my %stage = map { ($_->{stage} => $_) } @{$account->{time_line}};
+        my $thumbs_s = $stage{thumbnails}{ended_s};
         system('sync');
         $t = now();
         system("cp -r $r->{takes}/$id/raw $r->{dir}/copy && sync") && die;
         my $cp_s = now() - $t;
         system('rm', '-rf', "$r->{dir}/copy", "$r->{takes}/$id");
         next if !$turn;
-        push @take_s, $take_s; push @cp_s, $cp_s; push @collect_s, $collect_s; push @sim_cpu_s, $used[0]; push @rig_cpu_s, $used[1];
+        push @take_s, $take_s; push @cp_s, $cp_s; push @collect_s, $collect_s; push @thumbs_s, $thumbs_s; push @sim_cpu_s, $used[0]; push @rig_cpu_s, $used[1];
     }
     printf "85 cameras, %.0f MB: button to verified %s s; shot to last frame safe %s s; cp + sync %s s\n", 1e-6 * $bytes, map { join ' ', map { sprintf '%.2f', $_ } @$_ } \@take_s, \@collect_s, \@cp_s;
     printf "medians: take %.2f s = %.0f MB/s (from the shot: %.2f s = %.0f MB/s), cp + sync %.2f s = %.0f MB/s\n", map { ($_, 1e-6 * $bytes / $_) } map { median(@$_) } \@take_s, \@collect_s, \@cp_s;
+    printf "all %d thumbnails there, after the button: %s s; median %.2f s\n", 85, join(' ', map { sprintf '%.2f', $_ } @thumbs_s), median(@thumbs_s);
     printf "processor of a take: rigsim, which makes the pixels, %.2f s, rigd with its workers %.2f s\n", median(@sim_cpu_s), median(@rig_cpu_s);
     @kb = map { private_kb($_) } workers($r);
     printf "private memory of workers after 4 takes: median %d kB, most %d kB\n", median(@kb), max(@kb);

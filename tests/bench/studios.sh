@@ -50,8 +50,10 @@ through_sensors() {
     rm -r "$to-raw"
 }
 
+taken() { ls -d "$out"/demo/takes/*/solve/standard/report.json 2>/dev/null | sed 's,/solve/standard/report.json$,,' | tail -n 1; } # by command or by the board's button
+
 chain() {
-    [ -d "$out/demo/fixed" ] && ls -d "$out"/demo/takes/*_demo >/dev/null 2>&1 && [ -f "$(ls -d "$out"/demo/takes/*_demo | tail -n 1)/solve/standard/report.json" ] && return 0
+    [ -z "$(taken)" ] || return 0
     say "$name: the whole chain"
     RIG_SCENE=$studio RIG_TEXTURE=$texture BIN=$bin sh tests/demo.sh "$out/demo" >"$out/demo.log" 2>&1 || { say "$name: the chain failed: $(tail -n 1 "$out/demo.log")"; return 1; }
 }
@@ -60,7 +62,7 @@ make_variant() {
     w=$(awk '!/^#/ && NF { print $3; exit }' "$studio/geometry/cameras/cameras.txt") h=$(awk '!/^#/ && NF { print $4; exit }' "$studio/geometry/cameras/cameras.txt")
     fine=$((2 * w))x$((2 * h)) true=$studio/panorama.exr
     case $1 in
-    chain*|images|panorama) chain || return 0; take=$(ls -d "$out"/demo/takes/*_demo | tail -n 1) ;;
+    chain*|images|panorama) chain || return 0; take=$(taken) ;;
     esac
     case $1 in
     clean) solve clean joint clean "$studio/linear" "$true" ;;
