@@ -637,7 +637,7 @@ static void a_disk_that_was_full_for_a_moment_is_told_as_the_disk(void **state)
     struct worker w;
     struct stat st;
     scratch_write("whole", text, sizeof(text) - 1);
-    sim_start(&s, scratch_path("whole"), "* on shot 1 slow 1000000\n");
+    sim_start(&s, scratch_path("whole"), "* on shot 1 slow 2000000\n");
     unlink(scratch_path("whole"));
     signal(SIGXFSZ, SIG_IGN); // so it is inherited: the write fails instead
     worker_start(&w);
