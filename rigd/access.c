@@ -151,7 +151,8 @@ enum access access_judge(const struct access_request *r, const char *token, cons
         return ACCESS_WRONG_HOST;
     if (r->origin && !is_own_origin(r->origin, r->host))
         return ACCESS_WRONG_ORIGIN;
-    if (r->changes && r->fetch_site && strcasecmp(r->fetch_site, "same-origin") && strcasecmp(r->fetch_site, "none"))
+    // Without Origin come pictures, frames and windows of other pages. They may link to what is over soon.
+    if ((r->changes || r->stays) && r->fetch_site && strcasecmp(r->fetch_site, "same-origin") && strcasecmp(r->fetch_site, "none"))
         return ACCESS_WRONG_ORIGIN;
     const char *bearer = r->authorization && !strncasecmp(r->authorization, "Bearer ", 7) ? r->authorization + 7 : NULL;
     if (token && !access_is_token(token, bearer) && !access_is_token(token, r->cookie))

@@ -1,7 +1,7 @@
 // rigd/access.h - who may ask over HTTP: addresses, the token, and which headers a request must have.
 //
 // Pure but for access_token(). What it keeps out: other machines and users without the token; pages of other sites that make a
-// visitor's browser ask for them (Origin, Content-Type), also by a name of theirs that suddenly means 127.0.0.1 (Host).
+// visitor's browser ask for them (Origin, Sec-Fetch-Site, Content-Type), also by a name of theirs that suddenly means 127.0.0.1 (Host).
 #pragma once
 #include <stdbool.h>
 #include <sys/socket.h>
@@ -27,6 +27,7 @@ bool access_is_token(const char token[ACCESS_TOKEN_LENGTH + 1], const char *give
 
 struct access_request { // headers as they came; NULL: not there
     bool changes;       // POST: anything but looking
+    bool stays;         // an event stream: it would hold one of few places for as long as a foreign page likes
     const char *host, *origin, *fetch_site, *content_type;
     const char *authorization, *cookie;
 };

@@ -22,14 +22,17 @@ static double median(double *v, int n) // sorts v
     return n & 1 ? v[n / 2] : .5 * (v[n / 2 - 1] + v[n / 2]);
 }
 
-// Two-sided 95 % quantile of Student's t for n - 1 degrees of freedom; Cornish-Fisher's series, within 1 % from 4 on, tabled below.
+// What the normal distribution's quantile z is for Student's t with v degrees of freedom: Cornish and Fisher's series.
+static double student_series(double z, double v)
+{
+    return z + (z * z * z + z) / (4 * v) + (5 * pow(z, 5) + 16 * pow(z, 3) + 3 * z) / (96 * v * v);
+}
+
+// Two-sided 95 % quantile of Student's t for n - 1 degrees of freedom; the series is within 1 % from 4 on, tabled below.
 static double student(int n)
 {
     static const double few[] = { 12.706, 4.303, 3.182, 2.776, 2.571 };
-    const double z = 1.959964, v = n - 1;
-    if (v <= 5)
-        return few[n - 2];
-    return z + (z * z * z + z) / (4 * v) + (5 * pow(z, 5) + 16 * pow(z, 3) + 3 * z) / (96 * v * v);
+    return n - 1 <= 5 ? few[n - 2] : student_series(1.959964, n - 1);
 }
 
 int lag_estimate(struct lag *out, const double *lag_ms, int n)
@@ -65,6 +68,33 @@ int lag_estimate(struct lag *out, const double *lag_ms, int n)
         out->error_ms = student(out->n) * out->std_ms / sqrt(out->n);
     }
     return 0;
+}
+
+int lag_more_shots(const struct lag *lag, int n_cameras, double within_ms, int most)
+{
+    enum { TELLING = 10 }; // fewer shots do not tell how much a body scatters
+    int n_measured = 0, more = 0;
+    for (int i = 0; i < n_cameras; i++)
+        n_measured += lag[i].n > 0;
+    if (!n_measured || !(within_ms > 0))
+        return 0;
+    double z = 0, above = 8; // two-sided, and one of all may be the one in a hundred
+    for (int k = 0; k < 50; k++) {
+        const double middle = .5 * (z + above);
+        if (erfc(middle / sqrt(2)) > .01 / n_measured)
+            z = middle;
+        else
+            above = middle;
+    }
+    for (int i = 0; i < n_cameras; i++) {
+        if (!lag[i].n)
+            continue;
+        const double sigmas = lag[i].n < TELLING ? 0 : student_series(z, lag[i].n - 1);
+        const double needed = fmax(TELLING, ceil(pow(sigmas * lag[i].std_ms / within_ms, 2)));
+        if (needed > lag[i].n + more && needed <= lag[i].n + most)
+            more = (int)needed - lag[i].n;
+    }
+    return more;
 }
 
 int lag_delays(const struct lag *lag, int n_cameras, uint32_t max_us, uint32_t *delay_us)
@@ -128,7 +158,7 @@ int lag_write(const char *path, const struct config *config, const char *const *
             continue;
         struct json *o = json_new_object();
         json_set_string(o, "camera", config->camera[i].name);
-        json_set_string(o, "serial", serial[i]);
+        json_set_string(o, "serial", serial[i][0] ? serial[i] : config->camera[i].serial); // one that is off says none
         json_set_number(o, "mean_ms", lag[i].mean_ms);
         json_set_number(o, "std_ms", lag[i].std_ms);
         json_set_number(o, "error_ms", lag[i].error_ms);

@@ -14,6 +14,10 @@ struct lag {
 // n measurements in order of time. 0; -ENODATA for fewer than 3.
 int lag_estimate(struct lag *out, const double *lag_ms, int n);
 
+// How many shots more until the means of all bodies lie within within_ms of the truth, 99 times in 100 for the worst of them; 0: they
+// do. A body that scatters so much that it would take more than `most` is not waited for: its error_ms says what it is.
+int lag_more_shots(const struct lag *lag, int n_cameras, double within_ms, int most);
+
 // Delays that make all shutters open together: the slowest waits 0. Bodies with n == 0 are given the mean of the others.
 // delay_us[i] is at most max_us; returns how many would have needed more (0: all compensated).
 int lag_delays(const struct lag *lag, int n_cameras, uint32_t max_us, uint32_t *delay_us);

@@ -7,9 +7,9 @@
 //    gp_setting_set are defined here, and the dynamic linker prefers them to the library's; 2.5.31's hooks are not needed.
 //  - The driver lists each folder once and then believes its events. A listing that must be true is of a new session, unless
 //    the free space on the cards is what it was when the session began.
-//  - gp_camera_capture waits for an event that may be lost; a download ignores errors of writing; deleting a name that the
-//    driver has lost sight of deletes every picture on the card; a reply to a partial read may be longer than its buffer.
-//    See gphoto_trigger, gphoto_read, gphoto_delete, chunk.
+//  - gp_camera_capture waits for an event that may be lost; a download that is not taken whole leaves the link out of step;
+//    deleting a name that the driver has lost sight of deletes every picture on the card; a reply to a partial read may be
+//    longer than its buffer. See gphoto_trigger, pour, gphoto_delete, chunk.
 #include "rigd/camera_gphoto.h"
 #include "rigd/digest.h"
 
@@ -256,14 +256,20 @@ static bool is_fatal(const struct gphoto *g, int code, int64_t began_ns)
     return t == CAMERA_LOST || t == CAMERA_STALLED || t == CAMERA_BROKEN || t == CAMERA_BUSY;
 }
 
+// What a body says goes into journals and onto terminals: one line, and nothing that moves a cursor.
+static void make_plain(char *text)
+{
+    for (char *s = text; *s; s++)
+        if ((unsigned char)*s < ' ' || *s == 127)
+            *s = ' ';
+}
+
 static void on_words(GPContext *context, const char *text, void *arg)
 {
     struct gphoto *g = arg;
     (void)context;
     snprintf(g->said, sizeof(g->said), "%s", text);
-    for (char *s = g->said; *s; s++)
-        if ((unsigned char)*s < ' ')
-            *s = ' ';
+    make_plain(g->said);
 }
 
 static GPContextFeedback on_cancel(GPContext *context, void *arg)
@@ -572,6 +578,7 @@ static void widget_text(CameraWidget *w, char *out, size_t room)
     default:
         break;
     }
+    make_plain(out);
 }
 
 // One of the driver's settings by its name. 1 and *out (to be unreferenced), 0: the body does not have it now, < 0: trouble.
@@ -1184,16 +1191,16 @@ struct pouring {
     uint64_t size, most;
 };
 
+// Once something is wrong the rest is dropped, not refused: a driver that is stopped within an answer takes what is left of it
+// for the next one.
 static int pour(void *arg, unsigned char *bytes, uint64_t *n)
 {
     struct pouring *p = arg;
-    if (*n > p->most - p->size) {
-        p->size += *n;
-        return GP_ERROR_CORRUPTED_DATA;
-    }
+    const bool fits = p->size <= p->most && *n <= p->most - p->size;
     p->size += *n;
-    p->err = p->sink(p->arg, bytes, *n);
-    return p->err ? GP_ERROR_IO_WRITE : GP_OK;
+    if (fits && !p->err)
+        p->err = p->sink(p->arg, bytes, *n);
+    return GP_OK;
 }
 
 // In one go, for bodies that cannot read parts.
@@ -1221,7 +1228,7 @@ static int read_preview(struct gphoto *g, const struct camera_object *o, struct 
     if (code >= 0)
         code = gp_file_get_data_and_size(file, &bytes, &n);
     if (code >= 0 && n)
-        code = pour(p, (unsigned char *)bytes, &(uint64_t){ n });
+        pour(p, (unsigned char *)bytes, &(uint64_t){ n });
     gp_file_unref(file);
     return code;
 }
@@ -1246,7 +1253,7 @@ int gphoto_read(struct gphoto *g, const struct camera_object *o, bool preview, g
     if (preview) {
         code = read_preview(g, o, &p);
     } else {
-        while (code >= 0 && p.size < p.most) {
+        while (code >= 0 && !p.err && p.size < p.most) {
             uint64_t n = p.most - p.size < CHUNK ? p.most - p.size : CHUNK;
             const uint64_t asked = n;
             began = begin(g);
@@ -1261,12 +1268,12 @@ int gphoto_read(struct gphoto *g, const struct camera_object *o, bool preview, g
             if (code >= 0 && (!n || n > asked))
                 break; // too few or too many, below
             if (code >= 0)
-                code = pour(&p, g->chunk, &n);
+                pour(&p, g->chunk, &n);
         }
     }
     if (p.err)
         return p.err; // the caller's own
-    if (code == GP_ERROR_CORRUPTED_DATA || (code >= 0 && !preview && p.size != p.most))
+    if (code == GP_ERROR_CORRUPTED_DATA || p.size > p.most || (code >= 0 && !preview && p.size != p.most))
         return gphoto_fail(e, CAMERA_CORRUPT, 0, "%s: %llu bytes came, %llu were announced: it is fetched again", o->name,
                            (unsigned long long)p.size, (unsigned long long)p.most);
     if (code < 0)
@@ -1330,12 +1337,13 @@ int gphoto_identify(struct gphoto *g, struct camera_event *e)
                 sleep_ms(20);
                 g->gone(g->arg);
             }
+            const int64_t ends = begin(g);
             gp_widget_set_value(w, &(int){ 0 });
-            gp_camera_set_single_config(g->camera, name, w, g->context);
+            const int off = gp_camera_set_single_config(g->camera, name, w, g->context);
+            gp_widget_unref(w);
+            return off < 0 && is_fatal(g, off, ends) ? failed(g, e, off, ends, "it does not end its live view") : 0;
         }
         gp_widget_unref(w);
-        if (code >= 0)
-            return 0;
         if (is_fatal(g, code, began))
             return failed(g, e, code, began, "cannot make it show itself");
     }

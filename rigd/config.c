@@ -52,6 +52,7 @@ static const struct key rig_keys[] = {
 };
 static const struct key calibration_keys[] = {
     { "shots", INTEGER, FIELD(config, calibration_shots), 3, 1000, false },
+    { "within_ms", NUMBER, FIELD(config, lag_within_ms), 0, 1000, false },
     { "max_std_ms", NUMBER, FIELD(config, lag_max_std_ms), 0, 1000, false },
 };
 static const struct key trigger_keys[] = {
@@ -835,11 +836,11 @@ static void check_panorama(struct reader *r)
     struct config *c = r->config;
     struct panorama_config *p = &c->panorama;
     p->camera = CONFIG_NONE;
-    if (!(r->seen_sections >> PANORAMA & 1) || r->n_findings)
-        return;
     for (int i = 0; i < c->n_cameras; i++)
         if (!strcmp(c->camera[i].name, p->camera_name))
             p->camera = i;
+    if (!(r->seen_sections >> PANORAMA & 1) || r->n_findings)
+        return;
     if (p->camera == CONFIG_NONE)
         complain(r, r->panorama_line, "[panorama] camera = %s, but there is no [camera \"%s\"]; add it, or name another", p->camera_name, p->camera_name);
     else if (c->n_cameras == 1)
@@ -877,6 +878,7 @@ static void set_defaults(struct config *c)
     c->collect_timeout_ms = 8000;
     c->fetch_timeout_ms = 120000;
     c->calibration_shots = 30;
+    c->lag_within_ms = .1;
     c->lag_max_std_ms = 15;
     struct panorama_config *p = &c->panorama;
     p->camera = CONFIG_NONE;

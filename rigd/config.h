@@ -7,7 +7,7 @@
 #include "rigd/camera.h"
 #include "rigd/lens.h"
 
-enum { CONFIG_CAMERAS_MAX = 256, CONFIG_NONE = -1, CONFIG_CAPTURE = -2, CONFIG_STOPS_MAX = 64, CONFIG_FRAMES_MAX = 32 };
+enum { CONFIG_CAMERAS_MAX = 256, CONFIG_NONE = -1, CONFIG_CAPTURE = -2, CONFIG_STOPS_MAX = 64, CONFIG_FRAMES_MAX = 32, CONFIG_SHOTS_FACTOR = 4 };
 
 struct config_camera {       // [camera "A01"]
     char name[24];           // letters, digits, - and _: it names files
@@ -119,7 +119,8 @@ struct config {
     uint32_t fetch_timeout_ms;   // one object, however slow, while bytes keep coming
     int may_miss;                // cameras a take may leave out because they are not fit
     // [calibration]
-    int calibration_shots;
+    int calibration_shots;       // at least; up to CONFIG_SHOTS_FACTOR times as many
+    double lag_within_ms;        // until the mean of each body is known so well; 0: no more shots than calibration_shots
     double lag_max_std_ms;
     struct trigger_config trigger;
     struct web_config web;

@@ -368,7 +368,7 @@ int rig_calibrate(struct rig *r, int64_t now, int n_shots, char *why)
         return -EINVAL;
     }
     for (int i = 0; i < r->n; i++) {
-        double *grown = realloc(r->body[i].sample_ms, (size_t)n_shots * sizeof(double));
+        double *grown = realloc(r->body[i].sample_ms, (size_t)n_shots * CONFIG_SHOTS_FACTOR * sizeof(double));
         if (!grown) {
             snprintf(why, 200, "out of memory");
             return -ENOMEM;
@@ -382,6 +382,7 @@ int rig_calibrate(struct rig *r, int64_t now, int n_shots, char *why)
     r->n_shots = 0;
     r->n_fire_tries = 0;
     r->n_shots_wanted = n_shots;
+    r->n_shots_most = n_shots * CONFIG_SHOTS_FACTOR;
     rig_begin_preflight(r, now);
     rig_settle(r, now);
     return 0;

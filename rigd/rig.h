@@ -106,7 +106,8 @@ int rig_panorama(struct rig *rig, int64_t now_ns, const struct rig_take *take, c
 int rig_continue(struct rig *rig, int64_t now_ns, char *why); // what RIG_PROMPT asked for is done
 // Preflight alone.
 int rig_preflight(struct rig *rig, int64_t now_ns, char *why);
-// n shots without frames fetched: lag per body. Frames stay on the cards.
+// Shots without frames fetched: lag per body. n_shots at least; up to CONFIG_SHOTS_FACTOR times as many while lag_more_shots() asks for
+// them. Frames stay on the cards.
 int rig_calibrate(struct rig *rig, int64_t now_ns, int n_shots, char *why);
 // Finish a take of an earlier life; ledger (reconciled with the disk) is taken over and zeroed when 0 is returned. A panorama keeps the
 // exposures that are here or on the card, and shoots those that are missing: with a head that is turned by hand only if attended.

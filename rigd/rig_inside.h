@@ -128,7 +128,7 @@ struct rig {
         char judge[CAMERA_LENS_MAX];
     } panorama;
 
-    int n_fire_tries, n_shots, n_shots_wanted;
+    int n_fire_tries, n_shots, n_shots_wanted, n_shots_most;
     int64_t at_ns, pressed_ns, late_ns, released_ns, quiet_until_ns, shot_ns, thumbed_ns; // thumbed: the last thumbnail came; 0: none
     uint32_t *delay_us;
     uint64_t skip[CONFIG_CAMERAS_MAX / 64];

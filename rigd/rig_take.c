@@ -328,15 +328,20 @@ static void end_lag_shot(struct rig *r, int64_t now)
         if (b->part && b->flash_ns != INT64_MIN && b->n_samples < r->n_shots_wanted)
             b->sample_ms[b->n_samples++] = 1e-6 * (double)(b->flash_ns - r->pressed_ns);
     }
-    rig_say(r, RIG_INFO, CONFIG_NONE, "lag: shot %d of %d", ++r->n_shots, r->n_shots_wanted);
+    struct lag lag[CONFIG_CAMERAS_MAX];
+    if (++r->n_shots >= r->n_shots_wanted) {
+        for (int i = 0; i < r->n; i++)
+            lag_estimate(&lag[i], r->body[i].sample_ms, r->body[i].n_samples); // n = 0: too few
+        r->n_shots_wanted = r->n_shots + lag_more_shots(lag, r->n, r->config->lag_within_ms, r->n_shots_most - r->n_shots);
+    }
+    rig_say(r, RIG_INFO, CONFIG_NONE, "lag: shot %d of %d", r->n_shots, r->n_shots_wanted);
     if (r->n_shots < r->n_shots_wanted && !r->cancelled) {
         begin_arm(r, now);
         return;
     }
     for (int i = 0; i < r->n; i++) {
-        struct lag lag;
-        if (!lag_estimate(&lag, r->body[i].sample_ms, r->body[i].n_samples))
-            r->body[i].lag = lag;
+        if (!lag_estimate(&lag[i], r->body[i].sample_ms, r->body[i].n_samples))
+            r->body[i].lag = lag[i];
         else if (r->body[i].part)
             rig_say(r, RIG_WARNING, i, "no flash-sync contact in %d shots; check its cable", r->n_shots);
     }

@@ -904,7 +904,7 @@ static const struct argp_option option_list[] = {
     { "output", 'o', "FILE", 0, "panorama --merge: the EXR", 0 },
     { "without-missing", 'm', NULL, 0, "capture: leave cameras out that are not fit", 0 },
     { "on-button", OPTION_ON_BUTTON, NULL, 0, "capture: get ready, then let the trigger board fire by itself when its button is pressed; rigctl cancel disarms", 0 },
-    { "shots", 'k', "N", 0, "calibrate: how many (rigd.conf's)", 0 },
+    { "shots", 'k', "N", 0, "calibrate: at least how many (rigd.conf's)", 0 },
     { 0 },
 };
 

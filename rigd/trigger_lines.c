@@ -37,7 +37,6 @@ enum {
 struct shared { // with the guard
     _Atomic int64_t limit_ns[EDGES_WIRES_MAX];
     atomic_bool active;   // a shot is pending or a supply is cut
-    atomic_bool let_go;   // the guard had to
 };
 
 struct trigger_lines {
@@ -52,6 +51,7 @@ struct trigger_lines {
     pthread_t thread;
     bool locks, started, quit;
     bool broken, told_broken; // lines or guard are gone
+    bool told_stuck;          // they could not be released
     bool has_fired;           // fired() is due
     int result;
     int64_t pressed_ns, late_ns;
@@ -132,10 +132,8 @@ static void guard_run(struct trigger_lines *t, int guard_fd)
             else if (limit_ns)
                 active[w / 64] |= UINT64_C(1) << w % 64;
         }
-        if (over) {
+        if (over)
             t->ops->set(t->lines, active, all, now_ns);
-            atomic_store(&t->shared->let_go, true);
-        }
     }
     memset(active, 0, sizeof(active)); // rigd is gone
     t->ops->set(t->lines, active, all, clock_ns());
@@ -184,6 +182,12 @@ static void guard_alert(struct trigger_lines *t)
 
 // ---- outputs: under the lock ----------------------------------------------------------------------------------------------------
 
+// When nothing is active or planned any more, it may sleep.
+static void guard_may_sleep(struct trigger_lines *t)
+{
+    atomic_store(&t->shared->active, edges_next_ns(&t->edges) != EDGES_NEVER);
+}
+
 static void tell_loop(struct trigger_lines *t)
 {
     const uint64_t one = 1;
@@ -198,24 +202,27 @@ static void finish_shot(struct trigger_lines *t, int err)
     tell_loop(t);
 }
 
-// Everything off, whatever was said before.
-static void all_off(struct trigger_lines *t, bool relays)
+// Everything off, whatever was said before. 0, or -errno: something may still be pressed (logged).
+static int all_off(struct trigger_lines *t, bool relays)
 {
     struct edges_step s;
     edges_give_up(&t->edges, relays, &s);
     const int err = t->ops->set(t->lines, s.active, s.changed, clock_ns());
-    if (err && !t->broken)
-        log_error("trigger: cannot release the lines: %s: look at the wiring", strerror(-err));
+    if (err && !t->told_stuck)
+        log_error("trigger: cannot release the lines: %s: shutters may still be pressed: unplug them, then look at the wiring", strerror(-err));
+    t->told_stuck |= err != 0;
     t->broken |= err != 0;
     if (t->broken)
         tell_loop(t);
+    guard_may_sleep(t);
+    return err;
 }
 
 static void line_failed(struct trigger_lines *t, int err)
 {
-    log_error("trigger: a line failed: %s: all are released, the trigger is opened anew", strerror(-err));
     t->broken = true;
-    all_off(t, true);
+    if (!all_off(t, true)) // before a word about it: a journal may take its time
+        log_error("trigger: a line failed: %s: all are released, the trigger is opened anew", strerror(-err));
 }
 
 // Carry out one step of the plan. at_ns: when it counts as done.
@@ -232,18 +239,18 @@ static void carry_out(struct trigger_lines *t, int64_t at_ns)
     }
     if (err)
         line_failed(t, err);
+    if (pending && (err || s.done || s.cut)) {
+        if (s.cut && !err)
+            all_off(t, false);
+        finish_shot(t, err || s.too_late || s.cut ? -EIO : 0);
+    }
     if (s.too_late)
         log_error("trigger: this process did not run when the shutters were due; they are not pressed %lld ms late",
             (long long)(EDGES_LATE_MAX_NS / 1000000));
     if (s.cut)
         log_error("trigger: a line was held to its limit of %u ms and let go by the guard: this process did not run",
             t->config->trigger.max_hold_ms);
-    if (pending && (err || s.done || s.cut)) {
-        if (s.cut && !err)
-            all_off(t, false);
-        finish_shot(t, err || s.too_late || s.cut ? -EIO : 0);
-    }
-    atomic_store(&t->shared->active, edges_next_ns(&t->edges) != EDGES_NEVER);
+    guard_may_sleep(t);
 }
 
 static void *run(void *arg)
@@ -412,6 +419,7 @@ int trigger_lines_relay(void *self, int camera, bool cut)
                 finish_shot(t, -EIO);
             err = -EIO;
         }
+        guard_may_sleep(t);
         pthread_cond_signal(&t->wake); // it may not stay cut for ever
     }
     pthread_mutex_unlock(&t->lock);

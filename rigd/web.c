@@ -427,6 +427,7 @@ static bool is_refused(struct web *w, struct MHD_Connection *connection, const c
 {
     const struct access_request request = {
         .changes = is_post,
+        .stays = !strcmp(url, "/events"),
         .host = header(connection, "Host"),
         .origin = header(connection, "Origin"),
         .fetch_site = header(connection, "Sec-Fetch-Site"),

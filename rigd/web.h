@@ -2,7 +2,7 @@
 //
 //   GET /                     the page (rigd/web/)
 //   POST /api                 one request of the control protocol (CONTROL.md), its answer comes back
-//   GET /events               the answer to `status`, then events, one JSON object per server-sent message
+//   GET /events               the answer to `status`, then events, one JSON object per server-sent message; not for pages of other sites
 //   GET /takes/<id>/<file>    reports, contact sheets, thumbnails, models (take_files.h)
 //
 // A thread per connection, none of which touches the daemon: each is a client of the Unix socket, as rigctl is, and can do what that

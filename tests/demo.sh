@@ -106,6 +106,8 @@ imageformat = raw
 iso = 100
 aperture = 8
 shutter = $shutter
+[calibration]
+within_ms = 0
 [develop]
 after = on
 [reconstruct]

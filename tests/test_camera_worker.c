@@ -11,6 +11,7 @@
 #include <stdbool.h>
 #include <string.h>
 #include <sys/prctl.h>
+#include <sys/resource.h>
 #include <sys/socket.h>
 #include <sys/stat.h>
 #include <sys/wait.h>
@@ -52,7 +53,7 @@ static void sims_start(struct sim *s, int n_cameras, const char *personality, co
 {
     static int port = 15740; // rigs of one test have different ones
     int pipes[2];
-    char address[32], number[16], cameras[16], kind[64], script[900], line[256];
+    char address[32], number[16], cameras[16], kind[850], script[900], line[256];
     snprintf(address, sizeof(address), "--address=%s", loopback_address());
     snprintf(number, sizeof(number), "-p%d", port);
     snprintf(cameras, sizeof(cameras), "-n%d", n_cameras);
@@ -416,6 +417,27 @@ static void the_wrong_body_is_not_used(void **state)
     sim_stop(&s);
 }
 
+// What it says goes into journals and onto terminals.
+static void what_a_body_says_is_text_and_moves_no_cursor(void **state)
+{
+    (void)state;
+    static const char text[] = "base = generic\nmodel = Cam\033[2J\033[31mera\nfirmware = 1\b2\177\n";
+    struct sim s;
+    struct worker w;
+    scratch_write("rude", text, sizeof(text) - 1);
+    sim_start(&s, scratch_path("rude"), NULL);
+    unlink(scratch_path("rude"));
+    worker_start(&w);
+    const struct camera_event *e = done(&w, opening(&s, "generic"));
+    assert_non_null(strstr(e->facts.model, "era"));
+    for (const char *c = e->facts.model; *c; c++)
+        assert_true(*c >= ' ' && *c != 127);
+    for (const char *c = e->facts.firmware; *c; c++)
+        assert_true(*c >= ' ' && *c != 127);
+    worker_stop(&w);
+    sim_stop(&s);
+}
+
 static void what_a_body_does_not_take_is_told_not_hidden(void **state)
 {
     (void)state;
@@ -455,6 +477,20 @@ static void a_body_shows_itself_and_works_on(void **state)
         worker_stop(&w);
         sim_stop(&s);
     }
+}
+
+static void a_body_that_does_not_stop_showing_itself_is_told(void **state)
+{
+    (void)state;
+    struct sim s;
+    struct worker w;
+    sim_start(&s, "nikon", "* on op 0x9202 busy 1s\n");
+    worker_start(&w);
+    done(&w, opening(&s, "nikon"));
+    fails(&w, (struct camera_command){ .kind = CAMERA_IDENTIFY, .timeout_ms = 1000 }, CAMERA_BUSY);
+    assert_non_null(strstr(w.answer.text, "live view"));
+    worker_stop(&w);
+    sim_stop(&s);
 }
 
 static void a_flood_of_events_is_named_and_ends(void **state)
@@ -589,6 +625,44 @@ static void short_frames_get_no_name(void **state)
     assert_false(is_there("A01.dng.part"));
     worker_stop(&w);
     sim_stop(&s);
+}
+
+// A body that cannot read parts sends all in one go, and the driver does not hear that the disk was full for a moment in the middle of it.
+static void a_disk_that_was_full_for_a_moment_is_told_as_the_disk(void **state)
+{
+    (void)state;
+    enum { FULL_AT = 300000 }; // of 2 MB
+    static const char text[] = "base = generic\noperations = 0x1001 0x1002 0x1003 0x1004 0x1005 0x1006 0x1007 0x1008 0x1009 0x100a 0x100b 0x100e 0x100f 0x1014 0x1015 0x1016\n";
+    struct sim s;
+    struct worker w;
+    struct stat st;
+    scratch_write("whole", text, sizeof(text) - 1);
+    sim_start(&s, scratch_path("whole"), "* on shot 1 slow 2000000\n");
+    unlink(scratch_path("whole"));
+    signal(SIGXFSZ, SIG_IGN); // so it is inherited: the write fails instead
+    worker_start(&w);
+    signal(SIGXFSZ, SIG_DFL);
+    const struct camera_object o = shoot(&w, &s, "generic");
+    const struct rlimit small = { FULL_AT, RLIM_INFINITY }, all = { RLIM_INFINITY, RLIM_INFINITY };
+    assert_int_equal(prlimit(w.pid, RLIMIT_FSIZE, &small, NULL), 0);
+    const pid_t helper = fork();
+    assert_true(helper >= 0);
+    if (!helper) { // makes room when it was full for .2 s
+        for (int i = 0; i < 4000 && (stat(scratch_path("A01.dng.part"), &st) || st.st_size < FULL_AT); i++)
+            wait_ms(5);
+        wait_ms(200);
+        prlimit(w.pid, RLIMIT_FSIZE, &all, NULL);
+        _exit(0);
+    }
+    fails(&w, fetching(CAMERA_FETCH, &o, "A01.dng"), CAMERA_DISK);
+    waitpid(helper, NULL, 0);
+    assert_false(is_there("A01.dng"));
+    assert_false(is_there("A01.dng.part"));
+    done(&w, fetching(CAMERA_FETCH, &o, "A01.dng"));
+    assert_int_equal(w.answer.size_bytes, o.size_bytes);
+    worker_stop(&w);
+    sim_stop(&s);
+    unlink(scratch_path("A01.dng"));
 }
 
 static void nothing_is_written_over_a_strangers_file(void **state)
@@ -739,14 +813,17 @@ int main(void)
         cmocka_unit_test(a_frame_of_each_kind_comes_from_release_to_disk),
         cmocka_unit_test(a_lost_event_is_made_up_for_by_the_listing),
         cmocka_unit_test(the_wrong_body_is_not_used),
+        cmocka_unit_test(what_a_body_says_is_text_and_moves_no_cursor),
         cmocka_unit_test(what_a_body_does_not_take_is_told_not_hidden),
         cmocka_unit_test(a_body_shows_itself_and_works_on),
+        cmocka_unit_test(a_body_that_does_not_stop_showing_itself_is_told),
         cmocka_unit_test(a_flood_of_events_is_named_and_ends),
         cmocka_unit_test(a_busy_body_is_busy_and_not_bare_of_settings),
         cmocka_unit_test(a_full_card_is_the_card),
         cmocka_unit_test(a_broken_link_leaves_nothing_and_heals_by_opening),
         cmocka_unit_test(frames_that_do_not_unpack_get_no_name),
         cmocka_unit_test(short_frames_get_no_name),
+        cmocka_unit_test(a_disk_that_was_full_for_a_moment_is_told_as_the_disk),
         cmocka_unit_test(nothing_is_written_over_a_strangers_file),
         cmocka_unit_test(killed_in_the_middle_a_frame_is_whole_or_not_there),
         cmocka_unit_test(hostile_replies_are_survived_or_kill_only_the_worker),

@@ -61,6 +61,7 @@ static void a_whole_configuration_is_read(void **state)
     assert_int_equal(c.trigger.full_line, 17);
     assert_int_equal(c.trigger.button_line, CONFIG_NONE);
     assert_true(c.clock_max_s == 2.5);
+    assert_true(c.lag_within_ms == .1); // unasked
     config_free(&c);
 }
 
@@ -171,6 +172,16 @@ static void a_panorama_camera_is_known_by_its_section(void **state)
     assert_int_equal(parse(&c, HEAD A01 P01 PANORAMA), 0); // a camera that cannot turn
     assert_int_equal(c.panorama.n_stops, 1);
     config_free(&c);
+}
+
+// It needs no line of its own, and is not told to get one because something else is wrong.
+static void one_fault_is_not_told_as_two(void **state)
+{
+    (void)state;
+    struct config c;
+    assert_int_equal(parse(&c, "[rig]\ntakes = t\n[trigger]\nkind = gpio\nchip = c\n" A01 "full_line = 4\n" P01 PANORAMA), -EINVAL);
+    assert_non_null(strstr(said, "rigd.conf:2:"));
+    assert_null(strstr(said, "P01"));
 }
 
 static void a_line_without_half_press_may_be_held_for_all_of_its_limit(void **state)
@@ -332,6 +343,7 @@ int main(void)
         cmocka_unit_test(a_whole_configuration_is_read),
         cmocka_unit_test(each_fault_is_named_with_its_line_and_a_remedy),
         cmocka_unit_test(a_panorama_camera_is_known_by_its_section),
+        cmocka_unit_test(one_fault_is_not_told_as_two),
         cmocka_unit_test(a_line_without_half_press_may_be_held_for_all_of_its_limit),
         cmocka_unit_test(what_rigsim_lists_is_accepted_as_it_stands),
         cmocka_unit_test(the_lines_of_a_board_are_outputs_and_inputs),

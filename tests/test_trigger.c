@@ -334,7 +334,7 @@ static void a_supply_comes_back_however_often_it_is_cut(void **state)
 enum { SETS_MAX = 4000 };
 
 struct fake_chip { // shared with forked processes
-    atomic_int n_sets, failing; // failing: that set() fails, counted from 1; 0: none
+    atomic_int n_sets, failing, failing_from; // that set() fails, counted from 1; from that one on; 0: none
     atomic_int level[CONFIG_CAMERAS_MAX + 1];
     struct { uint64_t active[LINES_WORDS], changed[LINES_WORDS]; int64_t at_ns; pid_t by; } set[SETS_MAX];
     int edges[2];                 // socketpair of struct lines_edge
@@ -362,7 +362,7 @@ static int fake_set(void *self, const uint64_t *active, const uint64_t *changed,
     memcpy(c->set[i].changed, changed, sizeof(c->set[i].changed));
     c->set[i].at_ns = clock_ns();
     c->set[i].by = getpid();
-    return i + 1 == c->failing ? -ENODEV : 0;
+    return i + 1 == c->failing || (c->failing_from && i + 1 >= c->failing_from) ? -ENODEV : 0;
 }
 
 static int fake_fd(const void *self)
@@ -548,10 +548,21 @@ static void release_in_the_middle_opens_everything_and_says_so_once(void **state
     trigger_lines_close(t);
 }
 
+static int n_active_when_told;
+
+static void look_when_told(void *arg, enum log_level level, const char *message)
+{
+    (void)arg, (void)message;
+    if (level >= LOG_WARNING)
+        n_active_when_told += n_active(chip->n_sets - 1);
+}
+
 static void a_line_that_breaks_in_the_middle_releases_all_and_tells_once(void **state)
 {
     (void)state;
     log_set_level(LOG_SILENT);
+    log_set_hook(look_when_told, NULL);
+    n_active_when_told = 0;
     for (int failing = 1; failing <= 3; failing++) { // half, full, release
         struct trigger_lines *t = open_fake(4);
         chip->failing = failing;
@@ -570,7 +581,40 @@ static void a_line_that_breaks_in_the_middle_releases_all_and_tells_once(void **
         assert_int_equal(heard.n_fired, 1);
         trigger_lines_close(t);
     }
+    log_set_hook(NULL, NULL);
     log_set_level(LOG_INFO);
+    assert_int_equal(n_active_when_told, 0); // a journal may take its time: first the lines, then the words
+}
+
+static char told[2000];
+
+static void keep_told(void *arg, enum log_level level, const char *message)
+{
+    const size_t n = strlen(told);
+    (void)arg;
+    if (level >= LOG_WARNING)
+        snprintf(told + n, sizeof(told) - n, "%s\n", message);
+}
+
+static void lines_that_cannot_be_released_are_not_said_to_be(void **state)
+{
+    (void)state;
+    struct trigger_lines *t = open_fake(2);
+    const struct trigger_shot shot = { .at_ns = clock_ns() + 50 * MS, .hold_ms = 10 };
+    chip->failing_from = 2; // from the release on
+    told[0] = 0;
+    log_set_level(LOG_SILENT);
+    log_set_hook(keep_told, NULL);
+    assert_int_equal(trigger_lines_fire(t, &shot), 0);
+    serve(t, &heard.n_broken, 1);
+    trigger_lines_close(t);
+    log_set_hook(NULL, NULL);
+    log_set_level(LOG_INFO);
+    assert_int_equal(heard.err, -EIO);
+    assert_null(strstr(told, "all are released"));
+    const char *stuck = strstr(told, "may still be pressed");
+    assert_non_null(stuck);
+    assert_null(strstr(stuck + 1, "may still be pressed")); // once
 }
 
 static void a_chip_that_is_gone_is_told(void **state)
@@ -653,24 +697,74 @@ static void stopped_in_the_middle_the_guard_lets_go_at_the_limit(void **state)
     assert_int_equal(waitpid(pid, &status, 0), pid);
 }
 
+// Of the trigger that is open; 0: this kernel does not tell.
+static pid_t guard_process(void)
+{
+    char path[64], children[64] = "";
+    snprintf(path, sizeof(path), "/proc/self/task/%d/children", getpid());
+    FILE *f = fopen(path, "r");
+    if (!f || !fgets(children, sizeof(children), f))
+        fprintf(stderr, "# no %s here: the guard cannot be found\n", path);
+    if (f)
+        fclose(f);
+    return atoi(children);
+}
+
+static long n_sleeps(pid_t pid)
+{
+    char path[64], line[200];
+    long n = -1;
+    snprintf(path, sizeof(path), "/proc/%d/status", (int)pid);
+    FILE *f = fopen(path, "r");
+    while (f && fgets(line, sizeof(line), f))
+        sscanf(line, "voluntary_ctxt_switches: %ld", &n);
+    if (f)
+        fclose(f);
+    return n;
+}
+
+// It looks a hundred times a second while something is pressed or cut, and a rig stands idle for weeks.
+static void with_nothing_to_watch_the_guard_sleeps(void **state)
+{
+    (void)state;
+    for (int how = 0; how < 3; how++) {
+        struct trigger_lines *t = open_fake(2);
+        const pid_t guard = guard_process();
+        const struct trigger_shot shot = { .at_ns = clock_ns() + 10 * MS, .hold_ms = how ? 2500 : 10 };
+        if (how < 2) {
+            assert_int_equal(trigger_lines_fire(t, &shot), 0);
+            wait_for_sets(1);
+            if (how)
+                trigger_lines_release(t);
+            serve(t, &heard.n_fired, 1);
+        } else {
+            assert_int_equal(trigger_lines_relay(t, 0, true), 0);
+            assert_int_equal(trigger_lines_relay(t, 0, false), 0);
+        }
+        poll(NULL, 0, 50);
+        const long before = guard ? n_sleeps(guard) : 0;
+        poll(NULL, 0, 300);
+        const long n = guard ? n_sleeps(guard) - before : 0;
+        if (n > 3)
+            fail_msg("after %s: it woke %ld times in 300 ms", how == 0 ? "a shot" : how == 1 ? "a release" : "a supply was given back", n);
+        trigger_lines_close(t);
+    }
+}
+
 static void without_its_guard_nothing_is_pressed(void **state)
 {
     (void)state;
     struct trigger_lines *t = open_fake(2);
-    char path[64], children[64] = "";
-    snprintf(path, sizeof(path), "/proc/self/task/%d/children", getpid());
-    FILE *f = fopen(path, "r");
-    if (!f || !fgets(children, sizeof(children), f)) {
-        fprintf(stderr, "# no %s here: the guard cannot be found\n", path);
+    const pid_t guard = guard_process();
+    if (!guard) {
         trigger_lines_close(t);
         return;
     }
-    fclose(f);
     const struct trigger_shot shot = { .at_ns = clock_ns() + 10 * MS, .hold_ms = 2000 };
     assert_int_equal(trigger_lines_fire(t, &shot), 0);
     wait_for_sets(1);
     log_set_level(LOG_SILENT);
-    kill(atoi(children), SIGKILL);
+    kill(guard, SIGKILL);
     serve(t, &heard.n_broken, 1);
     log_set_level(LOG_INFO);
     assert_int_equal(heard.err, -EIO);
@@ -970,10 +1064,12 @@ int main(void)
         cmocka_unit_test(one_shot_is_three_calls_to_the_chip),
         cmocka_unit_test(release_in_the_middle_opens_everything_and_says_so_once),
         cmocka_unit_test(a_line_that_breaks_in_the_middle_releases_all_and_tells_once),
+        cmocka_unit_test(lines_that_cannot_be_released_are_not_said_to_be),
         cmocka_unit_test(a_chip_that_is_gone_is_told),
         cmocka_unit_test(close_in_the_middle_opens_everything),
         cmocka_unit_test(killed_in_the_middle_the_guard_lets_go),
         cmocka_unit_test(stopped_in_the_middle_the_guard_lets_go_at_the_limit),
+        cmocka_unit_test(with_nothing_to_watch_the_guard_sleeps),
         cmocka_unit_test(without_its_guard_nothing_is_pressed),
         cmocka_unit_test(a_button_is_heard_once_however_it_bounces),
         cmocka_unit_test(a_sync_contact_is_heard_once_with_its_own_time),

@@ -342,6 +342,7 @@ static void pages_of_others_cannot_ask(void **state)
     }
     assert_int_equal(post("Sec-Fetch-Site: cross-site\r\n", "{\"do\":\"status\"}"), 403);
     assert_int_equal(post("Sec-Fetch-Site: same-site\r\n", "{\"do\":\"status\"}"), 403);
+    assert_int_equal(get("/", "Sec-Fetch-Site: cross-site\r\n"), 200); // but it may link to the page
     // A form of another site needs no leave to send these.
     assert_int_equal(post("Content-Type: text/plain\r\n", "{\"do\":\"status\"}"), 415);
     assert_int_equal(post("Content-Type: application/x-www-form-urlencoded\r\n", "{\"do\":\"status\"}"), 415);
@@ -349,6 +350,33 @@ static void pages_of_others_cannot_ask(void **state)
     assert_int_equal(n_handled, before);
     assert_int_equal(post("Origin: http://localhost\r\nSec-Fetch-Site: same-origin\r\n", "{\"do\":\"status\"}"), 200);
     assert_int_equal(post("Host: localhost:8420\r\nOrigin: http://localhost:8420\r\nContent-Type: application/json; charset=utf-8\r\n", "{\"do\":\"status\"}"), 200);
+}
+
+// A picture, a frame, a window of another page's asks without an Origin, and an event stream would stay: enough of them, and nobody else gets one.
+static void pages_of_others_hold_no_event_streams(void **state)
+{
+    static const char *const foreign[] = { "cross-site", "same-site", "Cross-Site", "something new" };
+    int fd[WEB_STREAMS_MAX];
+    (void)state;
+    for (int i = 0; i < WEB_STREAMS_MAX; i++) {
+        char text[300];
+        fd[i] = connect_to(port);
+        snprintf(text, sizeof(text), "GET /events HTTP/1.1\r\nHost: localhost\r\nSec-Fetch-Site: %s\r\nSec-Fetch-Mode: %s\r\n\r\n", foreign[i % 4], i % 8 < 4 ? "no-cors" : "navigate");
+        put(fd[i], text);
+        assert_true(read_until(fd[i], "\r\n\r\n"));
+        assert_int_equal(strncmp(answer, "HTTP/1.1 403", 12), 0);
+    }
+    static const char *const own[] = { "", "Sec-Fetch-Site: same-origin\r\n", "Sec-Fetch-Site: none\r\n" }; // an old browser or a program; the page; a person
+    for (int i = 0; i < 3; i++) {
+        char text[200];
+        const int mine = connect_to(port);
+        snprintf(text, sizeof(text), "GET /events HTTP/1.1\r\nHost: localhost\r\n%s\r\n", own[i]);
+        put(mine, text);
+        assert_true(read_until(mine, "status"));
+        leave_rudely(mine);
+    }
+    for (int i = 0; i < WEB_STREAMS_MAX; i++)
+        close(fd[i]);
 }
 
 static void make(const char *name, const char *text)
@@ -763,6 +791,7 @@ int main(void)
         cmocka_unit_test_setup_teardown(a_body_is_bounded, open_plain, close_web),
         cmocka_unit_test_setup_teardown(a_name_that_suddenly_means_this_machine_is_not_ours, open_plain, close_web),
         cmocka_unit_test_setup_teardown(pages_of_others_cannot_ask, open_plain, close_web),
+        cmocka_unit_test_setup_teardown(pages_of_others_hold_no_event_streams, open_plain, close_web),
         cmocka_unit_test_setup_teardown(files_of_takes_are_shown_and_no_others, open_plain, close_web),
         cmocka_unit_test_setup_teardown(events_come_as_they_happen, open_plain, close_web),
         cmocka_unit_test_setup_teardown(listeners_are_bounded_and_make_room_when_they_leave, open_plain, close_web),
