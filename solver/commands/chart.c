@@ -33,6 +33,7 @@
 #include <string.h>
 #include <sys/resource.h>
 #include <sys/wait.h>
+#include <time.h>
 #include <unistd.h>
 
 extern char **environ;
@@ -296,9 +297,15 @@ static int run_self(int *status, struct rusage *use, const char *const *argv, co
         log_error("chart: cannot start %s (its output goes to %s): %s", argv[1], log_path, strerror(err));
         return -err;
     }
-    while (wait4(child, &state, 0, use) < 0)
-        if (errno != EINTR)
+    for (pid_t ended = 0; ended != child;) {
+        ended = wait4(child, &state, WNOHANG, use);
+        if (ended < 0 && errno != EINTR)
             return -errno;
+        if (!ended) {
+            nanosleep(&(struct timespec){ 0, 20000000 }, NULL);
+            progress_add(0); // a sign of life
+        }
+    }
     *status = WIFEXITED(state) ? WEXITSTATUS(state) : 128 + WTERMSIG(state);
     return 0;
 }
