@@ -3,6 +3,7 @@
 
 #include "solver/stage1.h"
 #include "solver/take/log.h"
+#include "solver/take/progress.h"
 #include "solver/vec3.h"
 
 #include <errno.h>
@@ -10,7 +11,7 @@
 #include <stdlib.h>
 #include <string.h>
 
-enum { SAMPLES = 60000, FINE_SAMPLES = 200000 };
+enum { SAMPLES = 60000, FINE_SAMPLES = 200000, N_WEIGHTS = 7 }; // from the first w_sim to the last by tens
 static const double first_w_sim = 1e-3, last_w_sim = 1e-9;
 static const double least_gain = .045; // percent of white, root of the difference of squares: less is sampling and points for lights
 
@@ -40,7 +41,8 @@ static int search(struct relocation *r)
     struct stage1 *s = &r->s;
     int err = 0, n_worse = 0;
     double least = INFINITY;
-    for (double w = first_w_sim; !err && w >= .5 * last_w_sim; w /= 10) {
+    progress_begin("lights again", N_WEIGHTS);
+    for (double w = first_w_sim; !err && w >= .5 * last_w_sim; w /= 10, progress_add(1)) {
         double error;
         s->w_sim = w;
         err = stage1_minimise(s, 8, 1e-3, NULL);
@@ -60,6 +62,7 @@ static int search(struct relocation *r)
         if (n_worse > 1 && w < 1e-6)
             break;
     }
+    progress_end();
     return err;
 }
 

@@ -264,12 +264,24 @@ static int show_views(struct page *p, const struct report_inputs *in)
     return err;
 }
 
+// The take and what was asked for; of pictures without a take, the folder.
+static char *title_of(const struct page *p, const struct report_inputs *in)
+{
+    char *title = NULL, *real = realpath(in->solve_dir, NULL);
+    const char *take, *preset, *folder = real ? strrchr(real, '/') + 1 : in->solve_dir;
+    if (json_get_string(p->solved.report, "inputs.take", &take) || !strrchr(take, '/') || !strrchr(take, '/')[1] || json_get_string(p->solved.report, "preset", &preset))
+        title = strdup(*folder ? folder : in->solve_dir);
+    else if (asprintf(&title, "%s, %s", strrchr(take, '/') + 1, preset) < 0)
+        title = NULL;
+    free(real);
+    return title;
+}
+
 static int write_page(const struct page *p, const struct report_inputs *in)
 {
-    char *path = in->output ? strdup(in->output) : solved_path(in->solve_dir, "report.html"), *real = realpath(in->solve_dir, NULL);
-    const char *name = real ? strrchr(real, '/') + 1 : in->solve_dir;
+    char *path = in->output ? strdup(in->output) : solved_path(in->solve_dir, "report.html"), *title = title_of(p, in);
     const struct report_source source = {
-        .title = *name ? name : in->solve_dir,
+        .title = title,
         .report = p->solved.report,
         .exported = p->exported,
         .mesh = &p->solved.mesh,
@@ -282,9 +294,9 @@ static int write_page(const struct page *p, const struct report_inputs *in)
         .view = p->view,
         .n_views = p->n_views,
     };
-    const int err = path ? report_write(&source, path) : -ENOMEM;
+    const int err = path && title ? report_write(&source, path) : -ENOMEM;
     free(path);
-    free(real);
+    free(title);
     return err;
 }
 
