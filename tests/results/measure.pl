@@ -74,6 +74,8 @@ sub measure {
     printf "measure: %s: exit status %d, %.0f s of processor, %d s by the clock\n", $r->{id}, $rc, $user + $system, time - $began;
 }
 
+sub shown { my ($figure) = @_; $figure =~ /[.]\d{5}/ ? sprintf('%.4g', $figure) : $figure }
+
 # The figure in a log; undef: it is not there.
 sub figure {
     my ($text, $parse) = @_;
@@ -199,7 +201,7 @@ there: the rig is simulated, the board is its real image in simavr.
             print $p "\n## $section\n| id | target | figure | met | CPU s | measured by |\n|---|---|---|---|---|---|\n";
         }
         my $when = !$r->{date} ? '' : $r->{note} =~ /^note of/ ? " (*note*, $r->{date}, $r->{commit})" : " ($r->{date}, $r->{commit})";
-        print $p '| ', join(' | ', $t->{id}, cell($r->{target}), $r->{figure} eq '' ? '-' : "$r->{figure} $r->{unit}", $r->{met} eq 'no' ? '**no**' : $r->{met}, $r->{cpu_s} // '',
+        print $p '| ', join(' | ', $t->{id}, cell($r->{target}), $r->{figure} eq '' ? '-' : shown($r->{figure}) . " $r->{unit}", $r->{met} eq 'no' ? '**no**' : $r->{met}, $r->{cpu_s} // '',
             ($r->{command} // '') ne '' ? '`' . cell($r->{command}) . "`$when" : cell($t->{why} // '')), " |\n";
     }
     for (['no', 'Missed'], ['partly', 'Met in part'], ['not measured', 'Not measured']) {
@@ -208,7 +210,7 @@ there: the rig is simulated, the board is its real image in simavr.
         print $p "\n## $title\n";
         for my $t (map { $target{$_} } @those) {
             my $r = $row{$t->{id}};
-            print $p "- **$t->{id}** $t->{what}", $r->{figure} eq '' ? '.' : " ($r->{figure} $r->{unit}, wanted $t->{bound})." =~ s/ ,/,/r, join('', map { my $s = $_ =~ s/([^.])$/$1./r; " \u$s" } grep { length }
+            print $p "- **$t->{id}** $t->{what}", $r->{figure} eq '' ? '.' : ' (' . shown($r->{figure}) . " $r->{unit}, wanted $t->{bound})." =~ s/ ,/,/r, join('', map { my $s = $_ =~ s/([^.])$/$1./r; " \u$s" } grep { length }
                 $met eq 'partly' ? $t->{partly} : '', $t->{why} // ''), $t->{next} ? " *Next:* $t->{next}" : '', "\n";
         }
     }
