@@ -144,15 +144,16 @@ static void the_button_and_the_contacts_are_heard_when_they_closed(void **state)
     live_board_set(live, LIVE_BUTTON, 0, false, press_ns + 150 * MS);
     assert_true(serve(&heard.n_button, 1, 1000));
     assert_true(llabs(heard.button_ns - press_ns) < 5 * MS);
-    struct trigger_shot shot = { .half_ms = 50, .hold_ms = 100 };
-    fire(&shot);
+    // Two seconds ahead: on a machine that is too busy for half a one, contacts that are planned after loading would close late.
+    const struct trigger_shot shot = { .half_ms = 50, .hold_ms = 100, .at_ns = clock_ns() + 2000 * MS };
     double worst_us = 0;
     for (int i = 0; i < 16; i++) {
         live_board_set(live, i == 15 ? LIVE_CAPTURE : LIVE_INPUT, i, true, shot.at_ns + (30 + i) * MS);
         live_board_set(live, i == 15 ? LIVE_CAPTURE : LIVE_INPUT, i, false, shot.at_ns + (40 + i) * MS);
     }
+    assert_int_equal(trigger_fire(trigger, &shot), 0);
     for (int i = 0; i < 16; i++) {
-        assert_true(serve(&heard.n_feedback[i], 1, 2000));
+        assert_true(serve(&heard.n_feedback[i], 1, 4000));
         const double error_us = 1e-3 * (double)llabs(heard.feedback_ns[i] - shot.at_ns - (30 + i) * MS);
         worst_us = error_us > worst_us ? error_us : worst_us;
         assert_true(llabs(heard.feedback_ns[i] - heard.feedback_ns[0] - i * MS) < MS / 2); // each other's, by the board's clock alone
