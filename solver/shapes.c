@@ -15,7 +15,7 @@
 const char *const shape_names[SHAPE_N] = {"pebble", "vase", "knot", "bowl"};
 
 enum { MAX_CHARTS = 32, PROFILE_STEPS = 8192 };
-static const double MARGIN_UV = 1. / 48; // between charts, and to the border of the atlas: at 128 texels each chart has one around it of its own
+static const double MARGIN_UV = 1. / 96; // between charts, and to the border of the atlas
 
 struct chart_box {
     double min[2], max[2]; // flat, same unit as the place
