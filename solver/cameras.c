@@ -309,6 +309,16 @@ void camera_look_at(struct camera *c, const double centre_m[3], const double tar
         c->t_m[i] = -c->t_m[i];
 }
 
+bool camera_has_aspect(const struct camera *c, int width_px, int height_px)
+{
+    const int64_t across = (int64_t)height_px * c->width_px - (int64_t)width_px * c->height_px;
+    const int sides[] = {width_px, height_px, c->width_px, c->height_px};
+    bool is_rounding = false;
+    for (int i = 0; i < 4; i++)
+        is_rounding = is_rounding || 2 * llabs(across) <= sides[i];
+    return is_rounding;
+}
+
 void camera_resize(struct camera *c, int width_px, int height_px)
 {
     const double sx = (double)width_px / c->width_px, sy = (double)height_px / c->height_px;

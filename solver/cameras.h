@@ -63,6 +63,8 @@ const struct camera *cameras_find(const struct cameras *c, const char *name);
 // Set cam_from_world, t, centre so that the camera at centre_m looks at target_m with `up` upwards in the image.
 void camera_look_at(struct camera *c, const double centre_m[3], const double target_m[3], const double up[3]);
 
+// Is a picture of that size one of this camera's, larger or smaller, but for the rounding of one side to whole pixels?
+bool camera_has_aspect(const struct camera *c, int width_px, int height_px);
 // Scale intrinsics to an image of another size (same field of view).
 void camera_resize(struct camera *c, int width_px, int height_px);
 

@@ -94,12 +94,10 @@ int report_shrink(struct image *out, const struct image *image, int width, int h
 int report_photograph(struct image *out, struct camera *small, const struct image *picture, const struct camera *camera)
 {
     static const char *const names[] = { "R", "G", "B" };
-    const int64_t across = llabs((int64_t)picture->height * camera->width_px - (int64_t)picture->width * camera->height_px);
-    const double longest = fmax(fmax(picture->width, picture->height), fmax(camera->width_px, camera->height_px));
     const int width = picture->width < REPORT_PICTURE_PX ? picture->width : REPORT_PICTURE_PX;
     const int height = (int)((int64_t)picture->height * width / picture->width);
     int channel[3];
-    bool usable = 2 * across <= longest; // one side was rounded to whole pixels
+    bool usable = camera_has_aspect(camera, picture->width, picture->height);
     *out = (struct image){ 0 };
     for (int c = 0; c < 3; c++)
         usable &= (channel[c] = image_channel(picture, names[c])) >= 0;

@@ -315,18 +315,6 @@ static void read_texels(void *arg, int64_t begin, int64_t end, int worker)
     }
 }
 
-// Do both sizes differ by a scale, but for the rounding of one side of one of them?
-static bool has_aspect_of(const struct camera *camera, int width_px, int height_px)
-{
-    const int64_t across =
-        (int64_t)height_px * camera->width_px - (int64_t)width_px * camera->height_px;
-    const int sides[] = {width_px, height_px, camera->width_px, camera->height_px};
-    bool is_rounding = false;
-    for (int i = 0; i < 4; i++)
-        is_rounding = is_rounding || 2 * llabs(across) <= sides[i];
-    return is_rounding;
-}
-
 static int find_channels(struct view_job *job, const struct image *image, const char *path)
 {
     static const char *const read[] = {"R", "G", "B", "clip", NULL};
@@ -370,7 +358,7 @@ static int gather_view(struct view_job *job, const struct camera *calibrated, co
     err = find_channels(job, &image, path);
     if (err)
         goto done;
-    if (!has_aspect_of(&camera, image.width, image.height)) {
+    if (!camera_has_aspect(&camera, image.width, image.height)) {
         log_error("samples: view %s: %s has %d x %d pixels, but its camera is calibrated for %d x "
                   "%d, another aspect: is it cropped or turned?",
                   camera.name, path, image.width, image.height, camera.width_px, camera.height_px);
