@@ -219,6 +219,9 @@ gives 0 "render of the solve, finer than the take's cameras" "$rigsolve" render 
 gives 0 "report with photographs finer than their cameras" "$rigsolve" report "$dir/solve" --take "$dir/diffuse" --images "$dir/finer" -o "$dir/finer.html"
 perl -0777 -ne '@r = /RMSE ([\d.]+) %/g; print "RMSE @r %\n"; exit(@r == 4 && !grep({ $_ > 1 } @r) ? 0 : 1)' "$dir/finer.html" >>"$dir/log" 2>&1
 result $? "shows them, each seen by its own camera"
+grep -o '<h1>[^<]*' "$dir/finer.html" >"$dir/log"
+[ "$(cat "$dir/log")" = '<h1>diffuse, standard' ]
+result $? "and is called by its take and preset"
 perl -MJSON::PP -0777 -ne '$d = decode_json($_); $d->{views_held_out} = ["cam006"]; print encode_json($d)' "$dir/solve/report.json" >"$dir/solve3/report.json"
 gives 0 "report of a solve that set a view aside" "$rigsolve" report "$dir/solve3" --take "$dir/diffuse"
 grep -q '<h3>cam006 <small>(set aside' "$dir/solve3/report.html"
