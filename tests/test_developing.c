@@ -314,6 +314,9 @@ static void the_picture_carries_its_exposure(void **state)
     assert_string_equal(note, "2023:11:14 22:13:20");
     assert_int_equal(image_read_note(scratch_path("a.exr"), IMAGE_SPREAD_NOTE, note, sizeof(note)), 0);
     assert_string_equal(note, "0");
+    assert_int_equal(run(NULL, "$BIN/rigd-develop --ahd $D/a.dng $D/b.exr >/dev/null"), 0);
+    assert_int_equal(image_read_note(scratch_path("b.exr"), IMAGE_SPREAD_NOTE, note, sizeof(note)), 0);
+    assert_string_equal(note, "3");
     assert_int_equal(image_read_note(scratch_path("a.exr"), "studiorig.develop", note, sizeof(note)), 0);
     assert_int_equal(json_parse(&o, note, strlen(note), "the note"), 0);
     assert_true(number(o, "exposure.0") == 1. / 64);
