@@ -367,6 +367,7 @@ int main(int argc, char **argv)
         log_error("rigd-camera: descriptor 3 is no packet socket; start it by rigd");
         return 2;
     }
+    end_if_alone(NULL); // rigd died before PR_SET_PDEATHSIG: its commands hold no longer
     if (gphoto_create(&w.camera, end_if_alone, NULL)) {
         log_error("rigd-camera: no memory");
         return 1;
