@@ -21,6 +21,8 @@
 #include <stdlib.h>
 #include <string.h>
 
+enum { PACKET = 16 };
+
 struct rays {
     RTCDevice device;
     RTCScene scene;
@@ -185,6 +187,37 @@ bool rays_blocked(const struct rays *r, const float origin_m[3], const float dir
     rtcOccluded1(r->scene, &context, &ray);
 #endif
     return ray.tfar < 0; // Embree's sign for "hit": -infinity
+}
+
+void rays_blocked_from(const struct rays *r, const float origin_m[3], int n, const float (*dir)[3], const float *t_max, uint8_t *blocked)
+{
+    for (int begin = 0; begin < n; begin += PACKET) {
+        struct RTCRay16 packet = { 0 };
+        _Alignas(64) int asked[PACKET] = { 0 };
+        const int n_here = n - begin < PACKET ? n - begin : PACKET;
+        for (int i = 0; i < n_here; i++) {
+            struct RTCRay ray;
+            if (!make_ray(&ray, origin_m, dir[begin + i], 0, t_max[begin + i]))
+                continue;
+            asked[i] = -1;
+            packet.org_x[i] = ray.org_x, packet.org_y[i] = ray.org_y, packet.org_z[i] = ray.org_z;
+            packet.dir_x[i] = ray.dir_x, packet.dir_y[i] = ray.dir_y, packet.dir_z[i] = ray.dir_z;
+            packet.tnear[i] = ray.tnear, packet.tfar[i] = ray.tfar, packet.mask[i] = ray.mask;
+        }
+#if RTC_VERSION_MAJOR >= 4
+        struct RTCOccludedArguments how;
+        rtcInitOccludedArguments(&how);
+        how.flags = RTC_RAY_QUERY_FLAG_COHERENT;
+        rtcOccluded16(asked, r->scene, &packet, &how);
+#else
+        struct RTCIntersectContext context;
+        rtcInitIntersectContext(&context);
+        context.flags = RTC_INTERSECT_CONTEXT_FLAG_COHERENT;
+        rtcOccluded16(asked, r->scene, &context, &packet);
+#endif
+        for (int i = 0; i < n_here; i++)
+            blocked[begin + i] = asked[i] && packet.tfar[i] < 0;
+    }
 }
 
 bool rays_hit(const struct rays *r, const float origin_m[3], const float dir[3], float t_min,

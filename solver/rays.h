@@ -4,6 +4,7 @@
 #pragma once
 #include "solver/mesh.h"
 #include <stdbool.h>
+#include <stdint.h>
 
 struct rays;
 
@@ -20,6 +21,9 @@ void rays_free(struct rays *r); // NULL allowed
 // Anything between t_min and t_max? dir need not be unit; t is in units of |dir|; t below 0 never counts. A ray that asks
 // nothing (NaN, coordinates beyond 1.8e18, zero dir, t_max <= t_min) hits nothing.
 bool rays_blocked(const struct rays *r, const float origin_m[3], const float dir[3], float t_min, float t_max);
+// The same of n rays from one point, from t = 0 on: blocked[n] is 1 where rays_blocked() is true. Two to three times as fast as one by one
+// where neighbours in the list point alike.
+void rays_blocked_from(const struct rays *r, const float origin_m[3], int n, const float (*dir)[3], const float *t_max, uint8_t *blocked);
 // The first hit; false: none.
 bool rays_hit(const struct rays *r, const float origin_m[3], const float dir[3], float t_min, float t_max,
               struct ray_hit *hit);

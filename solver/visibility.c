@@ -18,7 +18,7 @@
 #include <stdlib.h>
 #include <string.h>
 
-enum { CHUNK = 256, LEAST_SUB = 4, MOST_SUB = 16, SECTORS = 6 };
+enum { CHUNK = 256, LEAST_SUB = 4, MOST_SUB = 16, SECTORS = 6, QUESTIONS = 64 };
 static const double near_cos = .7071; // lights further apart than 45 degrees are no neighbours
 
 static void to_double(double out[3], const float in[3])
@@ -234,6 +234,50 @@ static int32_t (*find_neighbours(const struct lights *l))[SECTORS]
 
 // ---- lights: tracing ----
 
+// Where a direction lies on the octahedron, unfolded to a square of 1024 x 1024 and walked along a Z curve: who is near in the order is
+// near in the sky.
+static uint32_t place_in_sky(const double dir[3])
+{
+    const double sum = fmax(fabs(dir[0]) + fabs(dir[1]) + fabs(dir[2]), 1e-300);
+    double x = dir[0] / sum, y = dir[1] / sum;
+    if (dir[2] < 0) {
+        const double folded = (1 - fabs(y)) * (x < 0 ? -1 : 1);
+        y = (1 - fabs(x)) * (y < 0 ? -1 : 1);
+        x = folded;
+    }
+    const uint32_t column = (uint32_t)((x + 1) * 511.5), row = (uint32_t)((y + 1) * 511.5);
+    uint32_t key = 0;
+    for (int bit = 0; bit < 10; bit++)
+        key |= (column >> bit & 1) << 2 * bit | (row >> bit & 1) << (2 * bit + 1);
+    return key;
+}
+
+struct listed_light {
+    uint32_t place;
+    int light;
+};
+
+static int by_place(const void *a, const void *b)
+{
+    const struct listed_light *one = a, *two = b;
+    return one->place != two->place ? (one->place < two->place ? -1 : 1) : (one->light > two->light) - (one->light < two->light);
+}
+
+// Rays of neighbours in the list are traced together: the more alike, the quicker.
+static int sort_by_place(int *listed, int n, const struct lights *l)
+{
+    struct listed_light *order = malloc(((size_t)n + 1) * sizeof(*order));
+    if (!order)
+        return -ENOMEM;
+    for (int i = 0; i < n; i++)
+        order[i] = (struct listed_light){ place_in_sky(l->dir_probe[listed[i]]), listed[i] };
+    qsort(order, (size_t)n, sizeof(*order), by_place);
+    for (int i = 0; i < n; i++)
+        listed[i] = order[i].light;
+    free(order);
+    return 0;
+}
+
 struct light_job {
     struct light_visibility *v;
     const struct rays *rays;
@@ -244,7 +288,7 @@ struct light_job {
     const double (*dir)[3]; // [n_listed][n_sub] R dh, of every sub-direction
     const double (*centre)[3];              // [n_lights] R dh
     const int32_t (*neighbour)[SECTORS];    // [n_lights], or NULL: n_sub is 1
-    uint8_t *centres;                       // [workers][n_lights] enum seen
+    uint8_t *seen;                          // [workers][n_lights (1 + n_sub)] enum seen; n_sub is 0 where it is 1
     _Atomic int64_t n_rays;
 };
 
@@ -258,33 +302,54 @@ static void towards_light(double u[3], const double rotated_dir[3], double q,
 
 enum seen { NOT_ASKED, BELOW, BLOCKED, SEEN };
 
-// From one texel to light i at R dh = rotated_dir.
-static enum seen look(const struct light_job *job, int i, const double rotated_dir[3], const double point[3], const double normal[3],
-                      const float start[3], int64_t *n_rays)
+// What one texel asks, many rays at a time.
+struct questions {
+    const struct light_job *job;
+    double point[3], normal[3];
+    float start[3];
+    int n;
+    float dir[QUESTIONS][3], t_max[QUESTIONS];
+    uint8_t *answer[QUESTIONS]; // enum seen
+    int64_t n_rays;
+};
+
+static void answer(struct questions *q)
 {
-    const double q = job->lights->inverse_distance[i], from[3] = { (double)start[0], (double)start[1], (double)start[2] };
-    double u[3];
-    towards_light(u, rotated_dir, q, job->lights->centre_m, point);
-    if (!(vec3_dot(normal, u) > 0))
-        return BELOW;
-    towards_light(u, rotated_dir, q, job->lights->centre_m, from);
-    const float dir[3] = { (float)u[0], (float)u[1], (float)u[2] };
-    const float t_max = q > 0 ? (float)(1 / q - (double)rays_offset_m(job->rays) / vec3_norm(u)) : INFINITY;
-    ++*n_rays;
-    return rays_blocked(job->rays, start, dir, 0, t_max) ? BLOCKED : SEEN;
+    uint8_t blocked[QUESTIONS];
+    rays_blocked_from(q->job->rays, q->start, q->n, (const float(*)[3])q->dir, q->t_max, blocked);
+    for (int i = 0; i < q->n; i++)
+        *q->answer[i] = blocked[i] ? BLOCKED : SEEN;
+    q->n_rays += q->n;
+    q->n = 0;
 }
 
-// Whether the edge of a shadow may cross light i's region. centre[n_lights]: what is known of the lights' centres; grows.
-static bool on_an_edge(const struct light_job *job, int i, uint8_t *centre, const double point[3], const double normal[3],
-                       const float start[3], int64_t *n_rays)
+// Does the texel see light i at R dh = rotated_dir? *seen is BELOW or, after the next answer(), BLOCKED or SEEN.
+static void ask(struct questions *q, int i, const double rotated_dir[3], uint8_t *seen)
+{
+    const struct light_job *job = q->job;
+    const double inverse_distance = job->lights->inverse_distance[i];
+    double u[3], from[3];
+    towards_light(u, rotated_dir, inverse_distance, job->lights->centre_m, q->point);
+    *seen = BELOW;
+    if (!(vec3_dot(q->normal, u) > 0))
+        return;
+    *seen = BLOCKED; // so that it is not asked twice
+    to_double(from, q->start);
+    towards_light(u, rotated_dir, inverse_distance, job->lights->centre_m, from);
+    for (int c = 0; c < 3; c++)
+        q->dir[q->n][c] = (float)u[c];
+    q->t_max[q->n] = inverse_distance > 0 ? (float)(1 / inverse_distance - (double)rays_offset_m(job->rays) / vec3_norm(u)) : INFINITY;
+    q->answer[q->n] = seen;
+    if (++q->n == QUESTIONS)
+        answer(q);
+}
+
+// Whether the edge of a shadow may cross light i's region; centre[n_lights]: who is seen.
+static bool on_an_edge(const struct light_job *job, int i, const uint8_t *centre)
 {
     for (int k = 0; k < SECTORS; k++) {
         const int32_t j = job->neighbour[i][k];
-        if (j < 0)
-            return true;
-        if (centre[j] == NOT_ASKED)
-            centre[j] = (uint8_t)look(job, j, job->centre[j], point, normal, start, n_rays);
-        if (centre[j] != BELOW && centre[j] != centre[i])
+        if (j < 0 || (centre[j] != BELOW && centre[j] != centre[i]))
             return true;
     }
     return false;
@@ -295,28 +360,43 @@ static void trace_texels(void *arg, int64_t begin, int64_t end, int worker)
     struct light_job *job = arg;
     struct light_visibility *v = job->v;
     const struct texels *t = job->texels;
-    uint8_t *centre = job->centres + (size_t)worker * (size_t)v->n_lights;
-    int64_t n_rays = 0;
+    const bool soft = v->n_sub > 1;
+    uint8_t *centre = job->seen + (size_t)worker * (size_t)v->n_lights * (size_t)(soft ? 1 + v->n_sub : 1);
+    uint8_t *sub = centre + v->n_lights; // [n_listed][n_sub]
+    struct questions q = { .job = job };
     for (int64_t i = begin; i < end; i++) {
-        double point[3], normal[3];
-        float start[3];
-        to_double(point, t->position_m[i]);
-        to_double(normal, t->normal[i]);
-        rays_start(job->rays, t->triangle[i], t->barycentric[i], start);
-        uint16_t *bits = v->bits + i * v->words_per_texel;
+        to_double(q.point, t->position_m[i]);
+        to_double(q.normal, t->normal[i]);
+        rays_start(job->rays, t->triangle[i], t->barycentric[i], q.start);
         memset(centre, NOT_ASKED, (size_t)v->n_lights);
+        for (int k = 0; k < job->n_listed; k++)
+            ask(&q, job->listed[k], job->centre[job->listed[k]], &centre[job->listed[k]]);
+        answer(&q);
+        for (int k = 0; soft && k < job->n_listed; k++)
+            for (int s = 0; centre[job->listed[k]] != BELOW && s < SECTORS; s++) {
+                const int32_t j = job->neighbour[job->listed[k]][s];
+                if (j >= 0 && centre[j] == NOT_ASKED)
+                    ask(&q, j, job->centre[j], &centre[j]);
+            }
+        answer(&q);
+        for (int k = 0; soft && k < job->n_listed; k++) {
+            const int light = job->listed[k];
+            uint8_t *seen = sub + (size_t)k * (size_t)v->n_sub;
+            seen[0] = NOT_ASKED;
+            if (centre[light] == BELOW || on_an_edge(job, light, centre))
+                for (int s = 0; s < v->n_sub; s++)
+                    ask(&q, light, job->dir[(int64_t)k * v->n_sub + s], &seen[s]);
+        }
+        answer(&q);
+        uint16_t *bits = v->bits + i * v->words_per_texel;
         for (int k = 0; k < job->n_listed; k++) {
             const int light = job->listed[k];
-            int n_above = 1, n_visible = 0;
-            if (centre[light] == NOT_ASKED)
-                centre[light] = (uint8_t)look(job, light, job->centre[light], point, normal, start, &n_rays);
-            n_visible = centre[light] == SEEN;
-            if (v->n_sub > 1 && (centre[light] == BELOW || on_an_edge(job, light, centre, point, normal, start, &n_rays))) {
+            const uint8_t *seen = sub + (size_t)k * (size_t)v->n_sub;
+            int n_above = 1, n_visible = centre[light] == SEEN;
+            if (soft && seen[0] != NOT_ASKED) {
                 n_above = n_visible = 0;
-                for (int s = 0; s < v->n_sub; s++) {
-                    const enum seen seen = look(job, light, job->dir[(int64_t)k * v->n_sub + s], point, normal, start, &n_rays);
-                    n_above += seen != BELOW, n_visible += seen == SEEN;
-                }
+                for (int s = 0; s < v->n_sub; s++)
+                    n_above += seen[s] != BELOW, n_visible += seen[s] == SEEN;
             }
             const unsigned bit = 1u << light % 16, word = bits[light / 16];
             bits[light / 16] = (uint16_t)(n_visible ? word | bit : word & ~bit);
@@ -325,21 +405,23 @@ static void trace_texels(void *arg, int64_t begin, int64_t end, int worker)
                     (uint8_t)(n_above ? (255 * n_visible + n_above / 2) / n_above : 0);
         }
     }
-    atomic_fetch_add_explicit(&job->n_rays, n_rays, memory_order_relaxed);
+    atomic_fetch_add_explicit(&job->n_rays, q.n_rays, memory_order_relaxed);
     progress_add(end - begin);
 }
 
 static int trace_listed(struct light_visibility *v, const struct rays *r, const struct texels *t,
-                        const struct lights *l, const struct panorama *p, const int *listed,
-                        int n_listed, uint64_t seed, int n_threads)
+                        const struct lights *l, const struct panorama *p, int *listed, int n_listed,
+                        uint64_t seed, int n_threads)
 {
     const size_t n_lights = (size_t)l->n + 1, n_workers = (size_t)(n_threads > 0 ? n_threads : parallel_n_cores());
     double(*dir)[3] = v->n_sub > 1 ? malloc(((size_t)n_listed * (size_t)v->n_sub + 1) * sizeof(dir[0])) : NULL;
     double(*centre)[3] = malloc(n_lights * sizeof(centre[0]));
-    uint8_t *centres = malloc(n_workers * n_lights);
+    uint8_t *seen = malloc(n_workers * n_lights * (v->n_sub > 1 ? 1 + (size_t)v->n_sub : 1));
     int32_t(*neighbour)[SECTORS] = v->n_sub > 1 ? find_neighbours(l) : NULL;
-    int err = -ENOMEM;
-    if (!centre || !centres || (v->n_sub > 1 && (!dir || !neighbour)))
+    int err = sort_by_place(listed, n_listed, l);
+    if (!centre || !seen || (v->n_sub > 1 && (!dir || !neighbour)))
+        err = -ENOMEM;
+    if (err)
         goto done;
     for (int i = 0; i < l->n; i++)
         mat3_mul_vec(centre[i], l->world_from_probe, l->dir_probe[i]);
@@ -361,7 +443,7 @@ static int trace_listed(struct light_visibility *v, const struct rays *r, const 
                              .dir = (const double(*)[3])dir,
                              .centre = (const double(*)[3])centre,
                              .neighbour = (const int32_t(*)[SECTORS])neighbour,
-                             .centres = centres };
+                             .seen = seen };
     progress_begin("trace lights", t->n);
     parallel_for(n_threads, t->n, CHUNK, trace_texels, &job);
     progress_end();
@@ -370,7 +452,7 @@ static int trace_listed(struct light_visibility *v, const struct rays *r, const 
 done:
     free(dir);
     free(centre);
-    free(centres);
+    free(seen);
     free(neighbour);
     return err;
 }

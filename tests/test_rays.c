@@ -70,6 +70,40 @@ static void blocked_as_brute_force_says_except_within_a_millionth_of_an_edge(voi
     assert_in_range(n_grazing, 0, n_all / 200);
 }
 
+static void many_rays_from_one_point_are_answered_as_each_is(void **state)
+{
+    (void)state;
+    enum { MOST = 70 };
+    const float hard[][3] = { { 0, 0, 0 }, { NAN, 0, 1 }, { INFINITY, 0, 1 }, { 1e-30f, 0, 0 }, { -0.f, 0, 1 } };
+    struct mesh mesh = ray_mesh_bumpy(40, 20);
+    struct rays *rays = rays_of(&mesh);
+    int n_blocked = 0, n_all = 0;
+    for (int i = 0; i < 500; i++) {
+        const int n = i % (MOST + 1), first_hard = i % 7 ? MOST : i % 11;
+        float origin[3], unused[3], dir[MOST][3], t_max[MOST];
+        uint8_t blocked[MOST + 1];
+        random_ray(&mesh, i, origin, unused);
+        if (i == 300)
+            origin[1] = NAN;
+        for (int k = 0; k < n; k++) {
+            random_ray(&mesh, 1000 * i + k, unused, dir[k]);
+            if (k >= first_hard && k - first_hard < 5)
+                memcpy(dir[k], hard[k - first_hard], sizeof(dir[k]));
+            t_max[k] = k % 13 == 5 ? 0 : k % 13 == 6 ? NAN : k % 3 ? INFINITY : .2f;
+        }
+        blocked[n] = 77;
+        rays_blocked_from(rays, origin, n, (const float(*)[3])dir, t_max, blocked);
+        assert_int_equal(blocked[n], 77);
+        for (int k = 0; k < n; k++, n_all++) {
+            assert_int_equal(blocked[k], rays_blocked(rays, origin, dir[k], 0, t_max[k]));
+            n_blocked += blocked[k];
+        }
+    }
+    assert_in_range(n_blocked, n_all / 10, n_all * 9 / 10);
+    rays_free(rays);
+    mesh_free(&mesh);
+}
+
 static void first_hit_is_the_nearest_and_lies_on_its_triangle(void **state)
 {
     (void)state;
@@ -333,6 +367,7 @@ int main(void)
 {
     const struct CMUnitTest tests[] = {
         cmocka_unit_test(blocked_as_brute_force_says_except_within_a_millionth_of_an_edge),
+        cmocka_unit_test(many_rays_from_one_point_are_answered_as_each_is),
         cmocka_unit_test(first_hit_is_the_nearest_and_lies_on_its_triangle),
         cmocka_unit_test(nothing_leaks_through_shared_edges_and_corners),
         cmocka_unit_test(interval_is_in_units_of_the_direction),
