@@ -13,7 +13,8 @@ enum { LINES = 96, STEPS = 128, BINS_PER_UNIT = 2, PROFILE_END = 5, N_BINS = SIL
 _Static_assert(N_BINS == 2 * PROFILE_END * BINS_PER_UNIT + 1, "from -PROFILE_END to PROFILE_END");
 static const double FAR_BEGIN = 6, INSIDE_BEGIN = 5, INSIDE_END = 9; // where either side is by itself
 static const double TANGENT = 3, STRAIGHT = .3;    // the silhouette's direction is looked for this far to either side, and it must be this straight
-static const double PLAIN = .1;                    // how much a background may vary, of the step
+static const double PLAIN = .1, ODD = .3;                    // how much a background may vary, of the step; how far beyond either side its pixels may be
+static const double LEAST_SHARE = -.5, MOST_SHARE = 1.5, SHARE_STEP = 2. / (SILHOUETTE_SHARES - 1);
 static const double MIXED = .02, UNCERTAIN = .015; // a share of foreign light that counts; the deviation of a mean share beyond which it says nothing
 
 struct look {
@@ -68,7 +69,7 @@ static bool crosses_too(const struct look *l, int axis, double across_px, double
 }
 
 // The line `across` crosses the silhouette at at_px. Its pixels' shares are added where the silhouette is straight and crosses at more
-// than 45 degrees, nothing else crosses nearby, and the background is plain.
+// than 45 degrees, nothing else crosses nearby, and the background is plain, without a lamp that just looks out from behind the object.
 static void add_crossing(const struct look *l, int k_unit, int axis, int across, double at_px, bool is_seen_before)
 {
     struct silhouette_profile *profile = &l->sums->at[k_unit];
@@ -103,13 +104,16 @@ static void add_crossing(const struct look *l, int k_unit, int axis, int across,
     const double background = far_sum / n_far, step = inside_sum / n_inside - background, variance = far_squares / n_far - background * background;
     if (!(variance < PLAIN * PLAIN * step * step))
         return;
+    for (int i = 0; i < n; i++)
+        if (place[i] < 0 && fabs((value[i] - background) / step - .5) > .5 + ODD)
+            return;
     profile->n_points++;
     for (int i = 0; i < n; i++) {
         const int bin = (int)floor((place[i] + PROFILE_END) * BINS_PER_UNIT + .5);
         if (bin < 0 || bin >= N_BINS)
             continue;
-        const double share = fmin(fmax((value[i] - background) / step, -.5), 1.5); // one lamp behind the object does not decide
-        profile->n[bin]++, profile->sum[bin] += share, profile->squares[bin] += share * share;
+        const double share = fmin(fmax((value[i] - background) / step, LEAST_SHARE), MOST_SHARE);
+        profile->n[bin][(int)((share - LEAST_SHARE) / SHARE_STEP + .5)]++;
     }
 }
 
@@ -140,20 +144,51 @@ static double level_at(const double mean[N_BINS], int bin, double level)
     return place_of(bin + (level - mean[bin]) / (mean[bin + 1] - mean[bin]));
 }
 
+// The mean share of a bin's pixels but for the tenth with the least and the tenth with the most, and that mean's deviation: a lamp that looks
+// out from behind the object here and there does not decide, an outline that is off to one side does.
+static double trimmed_mean(const int n[SILHOUETTE_SHARES], double *deviation)
+{
+    int total = 0, before = 0;
+    double sum = 0, squares = 0;
+    for (int i = 0; i < SILHOUETTE_SHARES; i++)
+        total += n[i];
+    const int cut = total / 10, kept = total - 2 * cut;
+    for (int i = 0; i < SILHOUETTE_SHARES; before += n[i++]) {
+        const int from = before > cut ? before : cut, to = before + n[i] < total - cut ? before + n[i] : total - cut;
+        const double share = LEAST_SHARE + i * SHARE_STEP;
+        if (to > from)
+            sum += (to - from) * share, squares += (to - from) * share * share;
+    }
+    *deviation = sqrt(fmax(squares / kept - sum / kept * (sum / kept), 0) / kept); // NaN of no pixels
+    return sum / kept;
+}
+
+// The middle of the steepest rise, of three.
+static double steepest_at(const double mean[N_BINS])
+{
+    int top = 1;
+    double sum = 0, moment = 0;
+    for (int b = 1; b < N_BINS - 2; b++)
+        if (mean[b + 1] - mean[b] > mean[top + 1] - mean[top])
+            top = b;
+    for (int b = top - 1; b <= top + 1; b++) {
+        const double rise = fmax(mean[b + 1] - mean[b], 0);
+        sum += rise, moment += rise * place_of(b + .5);
+    }
+    return moment / sum;
+}
+
 enum verdict { IS_KNOWN, IS_UNKNOWN, REACHES_FURTHER };
 
 // In the profile's own unit: the middle of the pictures' silhouette, and where it begins outside.
 static enum verdict read_profile(const struct silhouette_profile *p, double *middle, double *begin)
 {
-    double mean[N_BINS];
+    double mean[N_BINS], deviation[N_BINS];
     if (p->n_points < FEWEST_POINTS)
         return IS_UNKNOWN;
     for (int b = 0; b < N_BINS; b++) {
-        if (!p->n[b])
-            return IS_UNKNOWN;
-        mean[b] = p->sum[b] / p->n[b];
-        const double variance = p->squares[b] / p->n[b] - mean[b] * mean[b];
-        if (place_of(b) < -PROFILE_END / 2. && !(variance < UNCERTAIN * UNCERTAIN * p->n[b]))
+        mean[b] = trimmed_mean(p->n[b], &deviation[b]);
+        if (isnan(mean[b]))
             return IS_UNKNOWN;
     }
     int half = N_BINS / 2; // from the mesh's silhouette to the pictures', outwards or inwards
@@ -168,7 +203,13 @@ static enum verdict read_profile(const struct silhouette_profile *p, double *mid
         foot--;
     if (mean[foot] > MIXED)
         return REACHES_FURTHER;
-    *middle = level_at(mean, half, .5);
+    for (int b = 0; b <= foot; b++)
+        if (deviation[b] > UNCERTAIN)
+            return IS_UNKNOWN;
+    // Half the step is passed too far inside where the object's rim shines like what is behind it; the steepest place is by chance to one side
+    // where cameras are off, for then the outline is off to both. A mesh that is too large or small moves both.
+    const double passed = level_at(mean, half, .5), steepest = steepest_at(mean);
+    *middle = passed * steepest <= 0 ? 0 : fabs(passed) < fabs(steepest) ? passed : steepest;
     *begin = level_at(mean, foot, MIXED);
     return IS_KNOWN;
 }

@@ -8,14 +8,13 @@
 #include "solver/rays.h"
 #include "solver/take/image.h"
 
-enum { SILHOUETTE_UNITS = 3, SILHOUETTE_BINS = 21 };
+enum { SILHOUETTE_UNITS = 3, SILHOUETTE_BINS = 21, SILHOUETTE_SHARES = 101 };
 
 // What the pictures of a take show together. Zeroed before the first.
 struct silhouette {
     struct silhouette_profile { // at 1, 2 and 4 pixels a unit
         int n_points;           // of the silhouette, that had a plain background of another brightness
-        int n[SILHOUETTE_BINS]; // pixels by their distance from it
-        double sum[SILHOUETTE_BINS], squares[SILHOUETTE_BINS]; // of the object's share in their light
+        int n[SILHOUETTE_BINS][SILHOUETTE_SHARES]; // pixels by their distance from it and by the object's share in their light
     } at[SILHOUETTE_UNITS];
 };
 
