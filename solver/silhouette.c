@@ -12,8 +12,8 @@
 enum { LINES = 96, STEPS = 128, BINS_PER_UNIT = 2, PROFILE_END = 5, N_BINS = SILHOUETTE_BINS, FAR_END = 10, FEWEST_POINTS = 24 };
 _Static_assert(N_BINS == 2 * PROFILE_END * BINS_PER_UNIT + 1, "from -PROFILE_END to PROFILE_END");
 static const double FAR_BEGIN = 6, INSIDE_BEGIN = 5, INSIDE_END = 9; // where either side is by itself
-static const double TANGENT = 3, STRAIGHT = .3;    // the silhouette's direction is looked for this far to either side, and it must be this straight
-static const double PLAIN = .1, ODD = .3;                    // how much a background may vary, of the step; how far beyond either side its pixels may be
+static const double TANGENT = 3, STRAIGHT = .3; // the silhouette's direction is looked for this far to either side, and it must be this straight
+static const double PLAIN = .1, ODD = .3;       // how much a background may vary, of the step; how far beyond either side its pixels may be
 static const double LEAST_SHARE = -.5, MOST_SHARE = 1.5, SHARE_STEP = 2. / (SILHOUETTE_SHARES - 1);
 static const double MIXED = .02, UNCERTAIN = .015; // a share of foreign light that counts; the deviation of a mean share beyond which it says nothing
 
@@ -102,7 +102,7 @@ static void add_crossing(const struct look *l, int k_unit, int axis, int across,
     if (n_far < 2 || n_inside < 2)
         return;
     const double background = far_sum / n_far, step = inside_sum / n_inside - background, variance = far_squares / n_far - background * background;
-    if (!(variance < PLAIN * PLAIN * step * step))
+    if (!(fmax(variance, 0) < PLAIN * PLAIN * step * step))
         return;
     for (int i = 0; i < n; i++)
         if (place[i] < 0 && fabs((value[i] - background) / step - .5) > .5 + ODD)
@@ -218,9 +218,9 @@ void silhouette_add(struct silhouette *s, const struct rays *rays, const struct 
 {
     const struct look l = { .rays = rays, .camera = camera, .image = image, .rgb = rgb, .sums = s };
     for (int axis = 0; axis < 2; axis++) {
-        const int n_across = axis ? image->width : image->height;
-        for (int i = 0; i < LINES; i++)
-            follow_line(&l, axis, (int)((i + .5) * n_across / LINES));
+        const int n_across = axis ? image->width : image->height, n_lines = n_across < LINES ? n_across : LINES;
+        for (int i = 0; i < n_lines; i++)
+            follow_line(&l, axis, (int)((i + .5) * n_across / n_lines));
     }
 }
 
