@@ -11,9 +11,9 @@
 // Distances are counted in units: 1 px, or 2 or 4 where light reaches further than PROFILE_END of them. Inside is positive.
 enum { LINES = 96, STEPS = 128, BINS_PER_UNIT = 2, PROFILE_END = 5, N_BINS = SILHOUETTE_BINS, FAR_END = 10, FEWEST_POINTS = 24 };
 _Static_assert(N_BINS == 2 * PROFILE_END * BINS_PER_UNIT + 1, "from -PROFILE_END to PROFILE_END");
-static const double FAR_BEGIN = 6, INSIDE_BEGIN = 5, INSIDE_END = 9; // where either side is by itself
+static const double FAR_BEGIN = 6, INSIDE_BEGIN = 5, INSIDE_END = 9, WELL_INSIDE = 3.5; // where either side is by itself
 static const double TANGENT = 3, STRAIGHT = .3; // the silhouette's direction is looked for this far to either side, and it must be this straight
-static const double PLAIN = .1, ODD = .3;       // how much a background may vary, of the step; how far beyond either side its pixels may be
+static const double PLAIN = .1, ODD = .3, UNEVEN = .6; // how much a background may vary, of the step; how far beyond either side it may be; how much the object may vary
 static const double LEAST_SHARE = -.5, MOST_SHARE = 1.5, SHARE_STEP = 2. / (SILHOUETTE_SHARES - 1);
 static const double MIXED = .02, UNCERTAIN = .015; // a share of foreign light that counts; the deviation of a mean share beyond which it says nothing
 
@@ -69,7 +69,8 @@ static bool crosses_too(const struct look *l, int axis, double across_px, double
 }
 
 // The line `across` crosses the silhouette at at_px. Its pixels' shares are added where the silhouette is straight and crosses at more
-// than 45 degrees, nothing else crosses nearby, and the background is plain, without a lamp that just looks out from behind the object.
+// than 45 degrees, nothing else crosses nearby, and the background is plain, without a lamp that just looks out from behind the object, and no edge
+// of the object itself makes the step.
 static void add_crossing(const struct look *l, int k_unit, int axis, int across, double at_px, bool is_seen_before)
 {
     struct silhouette_profile *profile = &l->sums->at[k_unit];
@@ -104,9 +105,11 @@ static void add_crossing(const struct look *l, int k_unit, int axis, int across,
     const double background = far_sum / n_far, step = inside_sum / n_inside - background, variance = far_squares / n_far - background * background;
     if (!(fmax(variance, 0) < PLAIN * PLAIN * step * step))
         return;
-    for (int i = 0; i < n; i++)
-        if (place[i] < 0 && fabs((value[i] - background) / step - .5) > .5 + ODD)
+    for (int i = 0; i < n; i++) {
+        const double share = (value[i] - background) / step;
+        if ((place[i] < 0 && (share < -ODD || share > 1 + ODD)) || (place[i] > WELL_INSIDE && fabs(share - 1) > UNEVEN))
             return;
+    }
     profile->n_points++;
     for (int i = 0; i < n; i++) {
         const int bin = (int)floor((place[i] + PROFILE_END) * BINS_PER_UNIT + .5);
