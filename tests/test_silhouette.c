@@ -19,7 +19,7 @@ static const int RGB[3] = { 0, 1, 2 };
 // A Gaussian has 2 % left this many deviations away.
 static const double FOOT = 2.054;
 
-enum surroundings { EVEN, RAMP, LAMPS, SAME, MIRRORED };
+enum surroundings { EVEN, RAMP, LAMPS, SAME, MIRRORED, WILD };
 
 struct scene {
     struct mesh mesh;
@@ -43,6 +43,8 @@ static double background_at(enum surroundings around, int v, double u_px, double
         return .05 + .3 * u_px / W;
     case LAMPS: // 50 px wide, every 130
         return fmod(u_px + 37 * v, 130) < 50 && fmod(v_px, 130) < 50 ? 20 : .02;
+    case WILD: // cells of 5 px
+        return 1.2 * random_uniform(1, (uint64_t)v, (uint64_t)(u_px / 5) + 1000 * (uint64_t)(v_px / 5));
     default:
         return .9;
     }
@@ -239,6 +241,9 @@ static void pictures_that_do_not_tell_say_so(void **state)
     struct scene s;
     double reach, offset;
     scene_open(&s, SAME, 1); // no contrast
+    assert_false(measure(&s, &reach, &offset));
+    scene_close(&s);
+    scene_open(&s, WILD, 1); // not plain anywhere
     assert_false(measure(&s, &reach, &offset));
     scene_close(&s);
     scene_open(&s, EVEN, 0); // black
