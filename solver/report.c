@@ -635,6 +635,8 @@ static void put_tables(FILE *f, const struct report_source *s)
     put_text_row(f, r, "ended because of", "stop_reason");
     put_row(f, "seed", "%.0f", number_of(r, "seed"));
     put_row(f, "observations", "%.0f", number_of(r, "n_observations"));
+    put_row(f, "mixed light beside the object's outline", "up to %.1f px", number_of(r, "edge_reach_px"));
+    put_row(f, "distance kept from edges", "%.0f px", number_of(r, "edge_px"));
     put_row(f, "clipped", "%.3f %%", 100 * number_of(r, "clipped_share"));
     if (r && !json_get_numbers(r, "centre_m", centre, 3)) {
         fprintf(f, "<tr><th>the panorama's place, metres</th><td>%.4f, %.4f, %.4f", centre[0], centre[1], centre[2]);

@@ -6,6 +6,7 @@
 // views are dealt out to the texels by counting.
 #include "solver/samples.h"
 #include "solver/parallel.h"
+#include "solver/silhouette.h"
 #include "solver/take/half.h"
 #include "solver/take/image.h"
 #include "solver/take/log.h"
@@ -20,7 +21,6 @@
 #include <stdbool.h>
 #include <stdlib.h>
 #include <string.h>
-#include <strings.h>
 
 enum { CHUNK_TEXELS = 256, CHUNK_ROWS = 4, MAX_FOOTPRINT_PX = 8, MAX_VIEWS = UINT16_MAX + 1 };
 
@@ -330,19 +330,25 @@ static int find_channels(struct view_job *job, const struct image *image, const 
     return image_require_finite(image, read, path);
 }
 
-// Light from beyond an edge is in a demosaiced picture's pixels well inside of it. That is not noise: it says the same in every view
-// that the edge is in, and moves lights.
-static int erode_of(const char *path)
+// A view's picture, and its camera of the picture's size. On failure there is nothing to free.
+static int open_view(struct view_job *job, struct camera *camera, struct image *image, const char *path)
 {
-    enum { ROOM = 12, AHD_PX = 3, MOST_PX = 16 };
-    char text[ROOM], *end;
-    const char *dot = strrchr(path, '.');
-    if (!image_read_note(path, IMAGE_SPREAD_NOTE, text, sizeof(text))) {
-        const long px = strtol(text, &end, 10);
-        if (end != text && !*end)
-            return 1 + (px < 0 ? 0 : px > MOST_PX ? MOST_PX : (int)px);
+    int err = image_read(image, path);
+    if (err)
+        return err;
+    job->camera = camera, job->image = image;
+    err = find_channels(job, image, path);
+    if (!err && !camera_has_aspect(camera, image->width, image->height)) {
+        log_error("samples: view %s: %s has %d x %d pixels, but its camera is calibrated for %d x "
+                  "%d, another aspect: is it cropped or turned?",
+                  camera->name, path, image->width, image->height, camera->width_px, camera->height_px);
+        err = -EINVAL;
     }
-    return dot && (!strcasecmp(dot, ".tif") || !strcasecmp(dot, ".tiff")) ? 1 + AHD_PX : 1;
+    if (err)
+        image_free(image);
+    else
+        camera_resize(camera, image->width, image->height);
+    return err;
 }
 
 // Marks the texels that have a sample in job->mask and fills their value and flags.
@@ -350,22 +356,9 @@ static int gather_view(struct view_job *job, const struct camera *calibrated, co
 {
     struct camera camera = *calibrated;
     struct image image;
-    int err = image_read(&image, path);
+    int err = open_view(job, &camera, &image, path);
     if (err)
         return err;
-    job->camera = &camera, job->image = &image;
-    job->erode_px = job->settings->erode_px == ERODE_BY_PICTURE ? erode_of(path) : job->settings->erode_px;
-    err = find_channels(job, &image, path);
-    if (err)
-        goto done;
-    if (!camera_has_aspect(&camera, image.width, image.height)) {
-        log_error("samples: view %s: %s has %d x %d pixels, but its camera is calibrated for %d x "
-                  "%d, another aspect: is it cropped or turned?",
-                  camera.name, path, image.width, image.height, camera.width_px, camera.height_px);
-        err = -EINVAL;
-        goto done;
-    }
-    camera_resize(&camera, image.width, image.height);
     const size_t n_pixels = (size_t)image.width * (size_t)image.height;
     job->wanted = calloc(n_pixels, sizeof(job->wanted[0]));
     job->seen_m = malloc(n_pixels * sizeof(job->seen_m[0])); // touched only where wanted
@@ -385,6 +378,88 @@ done:
     job->wanted = NULL, job->seen_m = NULL;
     image_free(&image);
     return err;
+}
+
+// ---- how far from edges ---------------------------------------------------------------------
+
+// Light from beyond an edge, in pixels well inside of it, is not noise: it says the same in every view that the edge is in, and
+// moves lights. The note says how far developing may look, the pictures themselves how far light has come, by whatever way.
+enum { NO_NOTE = -1, AHD_SPREAD_PX = 3, MOST_SPREAD_PX = 16, LOOKED_AT_VIEWS = 8 };
+
+static int spread_noted_px(const char *path)
+{
+    enum { ROOM = 12 };
+    char text[ROOM], *end;
+    if (image_read_note(path, IMAGE_SPREAD_NOTE, text, sizeof(text)))
+        return NO_NOTE;
+    const long px = strtol(text, &end, 10);
+    return end == text || *end || px < 0 ? NO_NOTE : px > MOST_SPREAD_PX ? MOST_SPREAD_PX : (int)px;
+}
+
+// A pixel is itself the mean over its area, half a pixel to either side: less than SHARP_PX looks like that alone.
+static int spread_seen_px(double reach_px)
+{
+    static const double SHARP_PX = 1, OWN_PX = .5;
+    return reach_px <= SHARP_PX ? 0 : (int)lesser(ceil(reach_px - OWN_PX), MOST_SPREAD_PX);
+}
+
+// out->edge_reach_px and edge_offset_px.
+static int look_at_edges(struct samples *out, struct view_job *job, const struct cameras *cameras, const char *const *image_paths)
+{
+    struct silhouette together = {0};
+    int n = 0, err = 0;
+    for (int v = 0; v < cameras->n; v++)
+        n += image_paths[v] != NULL;
+    const int n_looked_at = n < LOOKED_AT_VIEWS ? n : LOOKED_AT_VIEWS;
+    for (int v = 0, i = 0, k = 0; v < cameras->n && k < n_looked_at && !err; v++) {
+        if (!image_paths[v] || i++ != (2 * k + 1) * n / (2 * n_looked_at))
+            continue;
+        struct camera camera = cameras->view[v];
+        struct image image;
+        k++;
+        err = open_view(job, &camera, &image, image_paths[v]);
+        if (err)
+            break;
+        silhouette_add(&together, job->rays, &camera, &image, job->rgb);
+        image_free(&image);
+    }
+    if (!err)
+        (void)silhouette_reach(&together, &out->edge_reach_px, &out->edge_offset_px); // or NaN
+    return err;
+}
+
+struct edge_words { // what is said about edges, once for all views
+    int n_unknown, n_beyond_note;
+    int noted_px; // of the last view beyond its note
+};
+
+static int edge_px_of(const char *path, const struct samples *s, const struct samples_settings *settings, struct edge_words *words)
+{
+    if (settings->erode_px != ERODE_BY_PICTURE)
+        return settings->erode_px;
+    const int noted = spread_noted_px(path);
+    if (isnan(s->edge_reach_px)) {
+        words->n_unknown += noted == NO_NOTE;
+        return 1 + (noted == NO_NOTE ? AHD_SPREAD_PX : noted);
+    }
+    const int seen = spread_seen_px(s->edge_reach_px);
+    if (noted >= seen)
+        return 1 + noted;
+    if (noted != NO_NOTE && seen > noted + 1)
+        words->n_beyond_note++, words->noted_px = noted;
+    return 1 + seen;
+}
+
+static void say_edges(const struct samples *s, const struct edge_words *words)
+{
+    if (words->n_unknown)
+        log_warning("samples: in %d of %d views neither a note in the picture nor the object's outline says how far light has spread over "
+                    "edges: samples keep %d px away, as after demosaicing by AHD",
+                    words->n_unknown, s->n_views, 1 + AHD_SPREAD_PX);
+    if (words->n_beyond_note)
+        log_warning("samples: pixels up to %.1f px from the object's outline see both sides of it, though their notes say that developing spread light by "
+                    "%d px: out of focus, moved, or are cameras or mesh off (on average by %.1f px)? Samples keep %d px away",
+                    s->edge_reach_px, words->noted_px, fabs(s->edge_offset_px), s->edge_px);
 }
 
 // ---- all views ------------------------------------------------------------------------------
@@ -473,7 +548,8 @@ int samples_gather(struct samples *out, const struct texels *t, const struct ray
         return -EINVAL;
     }
     const size_t n_texels = (size_t)t->n, n_views = (size_t)cameras->n;
-    struct samples s = {.n_texels = t->n, .n_views = cameras->n};
+    struct samples s = {.n_texels = t->n, .n_views = cameras->n, .edge_reach_px = NAN, .edge_offset_px = NAN};
+    struct edge_words words = {0};
     struct view_job job = {.texels = t, .rays = r, .settings = settings};
     struct kept_view *kept = calloc(n_views + 1, sizeof(kept[0]));
     job.mask = malloc(n_texels + 1);
@@ -485,19 +561,24 @@ int samples_gather(struct samples *out, const struct texels *t, const struct ray
     int err = -ENOMEM;
     if (!kept || !job.mask || !job.value || !job.flags || !s.first || !s.centre_m || !s.name)
         goto done;
-    err = 0;
+    err = settings->erode_px == ERODE_BY_PICTURE ? look_at_edges(&s, &job, cameras, image_paths) : 0;
     progress_begin("gather samples", cameras->n);
     for (int v = 0; v < cameras->n && !err; v++) {
         const struct camera *camera = &cameras->view[v];
         memcpy(s.centre_m[v], camera->centre_m, sizeof(s.centre_m[v]));
         memcpy(s.name[v], camera->name, sizeof(s.name[v]));
-        if (image_paths[v])
+        if (image_paths[v]) {
+            job.erode_px = edge_px_of(image_paths[v], &s, settings, &words);
+            s.edge_px = job.erode_px > s.edge_px ? job.erode_px : s.edge_px;
             err = gather_view(&job, camera, image_paths[v]);
+        }
         if (image_paths[v] && !err)
             err = keep_view(&kept[v], &job, s.first + 1);
         progress_add(1);
     }
     progress_end();
+    if (!err)
+        say_edges(&s, &words);
     if (!err)
         err = deal_out(&s, kept);
 done:

@@ -769,7 +769,7 @@ static int take_picture(struct job *job, const struct renderer *renderer,
 {
     static const char *const names[4] = {"R", "G", "B", "clip"};
     const struct synth_settings *s = job->settings;
-    char name[CAMERA_NAME_MAX + 64];
+    char name[CAMERA_NAME_MAX + 64], path[PATH_MAX];
     struct image image, stored = {0};
     int err = render_view(renderer, camera, &image);
     if (err)
@@ -792,8 +792,10 @@ static int take_picture(struct job *job, const struct renderer *renderer,
     }
     if (!err) {
         snprintf(name, sizeof(name), "%s/%s.exr", folder, camera->name);
-        err = write_image(job, &stored, name, s->final_float ? IMAGE_FLOAT : IMAGE_HALF, IMAGE_ZIP);
+        err = path_of(job, path, name);
     }
+    if (!err)
+        err = image_write_exr_noted(&stored, &(struct image_note){ IMAGE_SPREAD_NOTE, "0", 0 }, 1, path, s->final_float ? IMAGE_FLOAT : IMAGE_HALF, IMAGE_ZIP);
     image_free(&image), image_free(&stored);
     return err;
 }

@@ -457,7 +457,7 @@ static int render_one(const struct renderer *renderer, const struct camera *came
     if (err)
         return err;
     char *exr = output_path(a->output, camera->name, "exr"), *png = output_path(a->output, camera->name, "png");
-    err = exr && png ? image_write_exr(&image, exr, IMAGE_FLOAT, IMAGE_ZIP) : -ENOMEM;
+    err = exr && png ? image_write_exr_noted(&image, &(struct image_note){ IMAGE_SPREAD_NOTE, "0", 0 }, 1, exr, IMAGE_FLOAT, IMAGE_ZIP) : -ENOMEM;
     if (!err)
         err = image_write_png_srgb(&image, png, a->exposure_ev);
     free(exr);

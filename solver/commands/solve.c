@@ -18,6 +18,7 @@
 
 #include <argp.h>
 #include <errno.h>
+#include <math.h>
 #include <stdio.h>
 #include <stdlib.h>
 #include <string.h>
@@ -55,8 +56,8 @@ static const struct argp_option options[] = {
     { "distance", OPTION_DISTANCE, "M", 0, "first distance of all lights (joint: swept; alternating: 2)", 2 },
     { "w-sim", OPTION_W_SIM, "W", 0, "weight of the similarity term beside the mean of squares: alternating 3e-9; joint: the last one "
       "(default: chosen by views set aside)", 2 },
-    { "edge-px", OPTION_EDGE_PX, "N", 0, "leave out samples within N pixels of a silhouette or depth edge (1, and as far as developing "
-      "has spread light, if the picture says so; 4 in a TIFF)", 2 },
+    { "edge-px", OPTION_EDGE_PX, "N", 0, "leave out samples within N pixels of a silhouette or depth edge (1, and as far as light has "
+      "spread by the pictures' own notes and by what the object's outline shows; 4 where neither tells)", 2 },
     { "footprint-mean", OPTION_FOOTPRINT_MEAN, 0, 0, "a sample is the mean over its footprint, not the value at its centre", 2 },
     { "no-continuation", OPTION_NO_CONTINUATION, 0, 0, "joint: begin at --w-sim itself", 2 },
     { "no-planes", OPTION_NO_PLANES, 0, 0, "joint: do not look for lights that lie on one plane", 2 },
@@ -329,6 +330,9 @@ static struct json *make_report(const struct scene *scene, const struct settings
     json_set_int(o, "texture", s->texture);
     json_set_int(o, "n_observations", scene->samples.n);
     json_set_number(o, "clipped_share", scene->samples.clipped_share);
+    json_set_int(o, "edge_px", scene->samples.edge_px);
+    json_set_number(o, "edge_reach_px", scene->samples.edge_reach_px);
+    json_set_number(o, "edge_offset_px", scene->samples.edge_offset_px);
     json_set_number(o, "rmse_fit_percent", r->rmse_fit_percent);
     json_set_number(o, "rmse_held_out_percent", r->rmse_held_out_percent >= 0 ? r->rmse_held_out_percent : NAN);
     json_set_numbers(o, "centre_m", r->state.lights.centre_m, 3);
@@ -418,7 +422,7 @@ static int write_result(const struct scene *scene, const struct settings *s, con
     return err;
 }
 
-static void print_summary(const struct settings *s, const struct joint_result *r)
+static void print_summary(const struct settings *s, const struct samples *samples, const struct joint_result *r)
 {
     const double *c = r->state.lights.centre_m;
     printf("%s: RMSE %.3f %% on %lld fitted samples", method_names[s->joint.method], r->rmse_fit_percent, (long long)r->n_fit);
@@ -426,6 +430,8 @@ static void print_summary(const struct settings *s, const struct joint_result *r
         printf(", %.3f %% on %lld held out", r->rmse_held_out_percent, (long long)r->n_held_out);
     printf("; %d Jacobians, stop: %s\n", r->n_jacobians, r->stop_reason);
     printf("centre (%.4f, %.4f, %.4f) m, standard deviation %.1f mm\n", c[0], c[1], c[2], 1e3 * vec3_norm(r->centre_std_m));
+    if (!isnan(samples->edge_reach_px))
+        printf("object and background are mixed up to %.1f px from its outline; samples keep %d px away\n", samples->edge_reach_px, samples->edge_px);
     for (int i = 0; s->joint.model == REFLECT_DISNEY && i < DISNEY_N; i++)
         printf("%-16s %.4f +- %.4f\n", disney_parameter_names[i], r->state.theta[i], r->theta_std[i]);
     for (unsigned bit = 1; bit <= DOUBT_POOR_FIT; bit <<= 1)
@@ -483,7 +489,7 @@ int command_solve(int argc, char **argv)
             puts(text ? text : "");
             free(text);
         } else if (!err) {
-            print_summary(&s, &result);
+            print_summary(&s, &scene.samples, &result);
             if (materials.theta)
                 solve_print_materials(&materials);
         }

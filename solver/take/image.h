@@ -46,6 +46,10 @@ enum image_compression { IMAGE_ZIP, IMAGE_PIZ, IMAGE_STORED };
 // infinities). 0 or -errno (logged): -EDOM for a NaN, -EINVAL for two channels of one name.
 int image_write_exr(const struct image *image, const char *path, enum image_type type,
                     enum image_compression compression);
+// The same with notes in its header, below.
+struct image_note;
+int image_write_exr_noted(const struct image *image, const struct image_note *notes, int n_notes, const char *path, enum image_type type,
+                          enum image_compression compression);
 // The same from rows that are made one after the other, from the top: pictures larger than memory should hold twice. row fills
 // [width][n_channels] and returns 0 or -errno (which it has logged); notes become attributes of the header.
 struct image_rows {
@@ -71,7 +75,7 @@ int image_write_tiff16(const char *path, int width, int height, const struct ima
                        int (*row)(void *arg, int y, uint16_t *rgb), void *arg);
 // The text of a note of a scanline EXR whose last lines are there. 0, -errno of the open, -EINVAL (no EXR, or cut short), -ENODATA (no
 // such note, or a number), -EFBIG (room is the size of text). Not logged.
-#define IMAGE_SPREAD_NOTE "studiorig.spread_px" // of a developed picture: how many pixels around a pixel its value was made of, "0" to "16"
+#define IMAGE_SPREAD_NOTE "studiorig.spread_px" // of a developed or rendered picture: how many pixels around a pixel its value was made of, "0" to "16"
 int image_read_note(const char *path, const char *name, char *text, size_t room);
 // 8-bit PNG, n_channels 1 (grey), 3 or 4; pixels as they are (already encoded). Atomic. 0 or -errno (logged).
 int image_write_png(const char *path, int width, int height, int n_channels, const uint8_t *pixels);

@@ -584,11 +584,17 @@ static int row_of_image(void *arg, int y, float *row)
 
 int image_write_exr(const struct image *image, const char *path, enum image_type type, enum image_compression compression)
 {
+    return image_write_exr_noted(image, NULL, 0, path, type, compression);
+}
+
+int image_write_exr_noted(const struct image *image, const struct image_note *notes, int n_notes, const char *path, enum image_type type,
+                          enum image_compression compression)
+{
     const char *names[IMAGE_MAX_CHANNELS];
     for (int c = 0; c < image->n_channels; c++)
         names[c] = image->names[c];
     return image_write_exr_rows(&(struct image_rows){ image->width, image->height, image->n_channels, names, row_of_image, (void *)(uintptr_t)image },
-                                NULL, 0, path, type, compression);
+                                notes, n_notes, path, type, compression);
 }
 
 // ---- notes ----------------------------------------------------------------------------------
