@@ -126,7 +126,7 @@ $(BUILD)/tests/test_rigd_panorama: | $(BUILD)/bin/rigd-develop $(BUILD)/bin/rigd
 $(BUILD)/tests/bench/stability_joint: $(call object,solver/commands/arguments.c)
 $(addprefix $(BUILD)/obj/tests/,test_usb_camera.o $(addsuffix .o,$(BOARD_TESTS)) usb/usb_camera.o usb/usbfs.o board/fake_board.o board/live_board.o board/boardsim.o): CFLAGS_ALL += $(shell pkg-config --cflags umockdev-1.0 2>/dev/null)
 $(BUILD)/tests/test_usb_camera $(addprefix $(BUILD)/tests/,$(BOARD_TESTS)) $(BUILD)/tests/board/boardsim: LIBS += $(shell pkg-config --libs umockdev-1.0 2>/dev/null)
-$(addprefix $(BUILD)/tests/,$(BOARD_TESTS)) $(BUILD)/tests/board/boardsim: LIBS += -lsimavr -lelf
+$(addprefix $(BUILD)/tests/,$(BOARD_TESTS)) $(BUILD)/tests/board/boardsim: LIBS += -lsimavr -lelf -Wl,--wrap=clock_gettime,--wrap=pthread_cond_timedwait # board_time.h
 $(addprefix $(BUILD)/tests/,$(BOARD_TESTS)) $(BUILD)/tests/board/boardsim: | build/firmware/trigger.elf
 $(BUILD)/tests/test_usb_camera $(addprefix $(BUILD)/tests/,$(BOARD_TESTS)): | $(BUILD)/bin/rigd $(BUILD)/bin/rigd-camera
 $(BUILD)/tests/test_pcg: LIBS += $(if $(wildcard /usr/include/suitesparse/cholmod.h),-lcholmod)

@@ -188,6 +188,13 @@ void edges_step(struct edges *e, int64_t now_ns, struct edges_step *out)
     finish(e, out);
 }
 
+void edges_set(struct edges *e, const struct edges_step *step, int64_t now_ns)
+{
+    for (int w = 0; w < e->n_wires; w++)
+        if (e->wire[w].role == EDGES_FULL && e->wire[w].pressed && step->changed[w / 64] >> w % 64 & 1)
+            e->wire[w].release_ns = now_ns + e->hold_ns;
+}
+
 void edges_give_up(struct edges *e, bool relays, struct edges_step *out)
 {
     const bool pending = e->pending;

@@ -55,5 +55,6 @@ unsigned edges_abilities(const struct edges *e); // of TRIGGER_...: half-press, 
 int edges_plan(struct edges *e, const struct trigger_shot *shot, int64_t now_ns);
 int64_t edges_next_ns(const struct edges *e); // EDGES_NEVER: nothing to do
 void edges_step(struct edges *e, int64_t now_ns, struct edges_step *out);
+void edges_set(struct edges *e, const struct edges_step *step, int64_t now_ns); // the wires changed as late as that: presses of step count from now on
 void edges_give_up(struct edges *e, bool relays, struct edges_step *out); // all shutters (and relays) inactive; no shot pending
 void edges_relay(struct edges *e, int wire, bool cut, int64_t now_ns, struct edges_step *out);

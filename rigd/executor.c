@@ -43,7 +43,7 @@ struct executor {
     struct executor_host host;
     int epoll_fd, lock_fd; // -1: none
     struct running *job[EXECUTOR_JOBS_MAX];
-    // Process group of each job's program, written by its keeper in memory that both have; 0: none, or it was seen to.
+    // Process group of each job's program, written by that program and its keeper in memory that all have; 0: none, or it was seen to.
     volatile pid_t *group;
 };
 
@@ -106,7 +106,7 @@ int executor_lock_file(int fd, bool alone)
     return errno == EACCES || errno == EINTR ? -EAGAIN : -errno;
 }
 
-__attribute__((noreturn)) static void become(const struct executor_command *c, char **envp, const int *fd, pid_t keeper, int lock_fd)
+__attribute__((noreturn)) static void become(const struct executor_command *c, char **envp, const int *fd, pid_t keeper, int lock_fd, volatile pid_t *group)
 {
     sigset_t none;
     sigemptyset(&none);
@@ -114,6 +114,7 @@ __attribute__((noreturn)) static void become(const struct executor_command *c, c
     prctl(PR_SET_PDEATHSIG, SIGKILL);
     if (getppid() != keeper)
         _exit(127);
+    *group = getpid(); // by itself, before it can have children: the keeper may be killed at any moment
     if (getpriority(PRIO_PROCESS, 0) < NICENESS)
         setpriority(PRIO_PROCESS, 0, NICENESS);
     write_file("/proc/self/oom_score_adj", "500", 3);
@@ -160,12 +161,11 @@ __attribute__((noreturn)) static void keep(const struct executor_command *c, cha
         _exit(127); // the daemon has gone, and the next one is there
     const pid_t pid = fork();
     if (pid == 0)
-        become(c, envp, fd, self, lock_fd);
+        become(c, envp, fd, self, lock_fd, group);
     close_others(0, lock_fd); // the workers' sockets, the trigger's lines: not ours to hold
     if (pid < 0)
         _exit(127);
     setpgid(pid, pid);
-    *group = pid;
     for (;;) {
         const int s = sigwaitinfo(&all, &info);
         if (s == SIGTERM) {

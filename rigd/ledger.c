@@ -732,7 +732,7 @@ static bool is_part(const char *name) // .NAME.tag.part of atomic_file, NAME.par
     return n > 5 && !strcmp(name + n - 5, ".part");
 }
 
-static int remove_parts(const char *dir, int *n_removed)
+static int remove_parts_of(const char *prefix, const char *dir, int *n_removed)
 {
     char path[1400];
     DIR *d = opendir(dir);
@@ -740,13 +740,18 @@ static int remove_parts(const char *dir, int *n_removed)
         return errno == ENOENT ? 0 : -errno;
     int n = 0;
     for (const struct dirent *e; (e = readdir(d));)
-        if (is_part(e->d_name)) {
+        if (is_part(e->d_name) && !strncmp(e->d_name, prefix, strlen(prefix))) {
             join(path, sizeof(path), dir, e->d_name);
             n += unlink(path) == 0;
         }
     closedir(d);
     *n_removed += n;
     return n ? sync_folder(dir) : 0;
+}
+
+static int remove_parts(const char *dir, int *n_removed)
+{
+    return remove_parts_of("", dir, n_removed);
 }
 
 static void remove_new(const char *dir)
@@ -799,11 +804,14 @@ void ledger_remove_leftovers(const char *takes_dir)
 {
     char path[1024];
     DIR *d = opendir(takes_dir);
-    for (const struct dirent *e; d && (e = readdir(d));)
-        if (e->d_name[0] == '.' && is_part(e->d_name)) {
-            join(path, sizeof(path), takes_dir, e->d_name);
+    for (const struct dirent *e; d && (e = readdir(d));) {
+        int n = 0;
+        join(path, sizeof(path), takes_dir, e->d_name);
+        if (e->d_name[0] == '.' && is_part(e->d_name))
             remove_new(path); // only what ledger_create makes; a folder with anything else in it stays
-        }
+        else if (e->d_name[0] != '.')
+            remove_parts_of(".take.json.", path, &n); // a take that is verified is not reconciled
+    }
     if (d)
         closedir(d);
 }

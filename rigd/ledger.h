@@ -145,7 +145,7 @@ int ledger_parse(struct ledger *out, const char *text, size_t n_bytes, const cha
 // Create takes_dir/id with raw/, thumbnails/, linear/ and geometry/cameras/ (panorama/raw/) and its first ledger, whole and durable or not at all.
 // -EEXIST if there is one. 0 or -errno (logged).
 int ledger_create(const char *text, enum ledger_kind kind, const char *id, const char *takes_dir);
-void ledger_remove_leftovers(const char *takes_dir); // of creations that a crash ended; for the start of the daemon
+void ledger_remove_leftovers(const char *takes_dir); // of creations and of ledgers that a crash ended; for the start of the daemon
 
 // Bring ledger and disk together after a crash: remove *.part, hash frames that are here but not yet noted (they become COPIED),
 // take back COPIED notes whose file is missing, short or different (the copy is set aside as <name>.damaged, never deleted).

@@ -233,8 +233,10 @@ static void carry_out(struct trigger_lines *t, int64_t at_ns)
     const bool pending = t->edges.pending;
     edges_step(&t->edges, at_ns, &s);
     int err = s.any ? t->ops->set(t->lines, s.active, s.changed, at_ns) : 0;
+    const int64_t set_ns = t->ops->timed ? at_ns : clock_ns(); // a host that stood still in between shortens no pulse
+    edges_set(&t->edges, &s, set_ns);
     if (s.first) {
-        t->pressed_ns = t->ops->timed ? at_ns : clock_ns();
+        t->pressed_ns = set_ns;
         t->late_ns = t->pressed_ns - due_ns;
     }
     if (err)

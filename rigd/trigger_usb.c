@@ -25,7 +25,8 @@
 enum {
     SILENCE_MS = 500,          // the board lets go when it hears nothing for so long
     PING_MS = 100,
-    ANSWER_MS = 300,           // a board that needs longer has hung
+    ANSWER_MS = 300,           // a board that needs longer has hung: of time in which this process ran, for one that stood still finds the answer waiting
+    SLICE_MS = 20,             // at most so much of it is counted at once
     FEEDBACK_MS = 2000,        // flash-sync contacts are listened to so long after the last release
     CLOCK_ROUNDS = 12,         // before open returns
     CLOCK_FAST_MS = 20, CLOCK_MS = 50, // between round trips: until the window is full; then
@@ -42,7 +43,7 @@ struct talk { // a command under way
     uint8_t bytes[PROTO_FRAME_MAX];
     bool asked, flies, waits; // by the loop, to be sent; on its way; for its answer
     uint8_t sequence, type, n_payload;
-    int64_t since_ns;
+    int64_t since_ns, since_awake_ns;
     struct board_said answer;
 };
 
@@ -83,7 +84,8 @@ struct board {
     struct libusb_transfer *read[READS], *time;
     uint8_t packet[READS][PROTO_PACKET_BYTES], time_bytes[LIBUSB_CONTROL_SETUP_SIZE + 16];
     bool reads[READS], times;
-    int64_t time_sent_ns, time_next_ns, report_ns; // report: of a shot; INT64_MAX
+    int64_t time_sent_ns, time_awake_ns, time_next_ns, report_ns; // report: of a shot; INT64_MAX
+    int64_t awake_ns;        // how long the thread has run
     int n_rounds;
     unsigned seed;           // of the pauses between round trips: USB's frames must not beat with them
     struct heard heard[HEARD_MAX];
@@ -296,6 +298,7 @@ static void say(struct board *b, struct talk *k)
     k->asked = false;
     k->sequence = ++b->sequence;
     k->since_ns = clock_ns();
+    k->since_awake_ns = b->awake_ns;
     k->out->length = proto_seal(k->bytes, k->type, k->sequence, k->n_payload);
     const int err = libusb_submit_transfer(k->out);
     k->flies = k->waits = !err;
@@ -307,6 +310,7 @@ static void ask_time(struct board *b, int64_t now_ns)
 {
     const int64_t pause_ns = (b->n_rounds < CLOCK_ROUNDS ? 1 : b->n_rounds < BOARD_CLOCK_ROUNDS ? CLOCK_FAST_MS : CLOCK_MS) * MS;
     b->time_next_ns = now_ns + pause_ns / 2 + (int64_t)((double)rand_r(&b->seed) / RAND_MAX * (double)pause_ns);
+    b->time_awake_ns = b->awake_ns;
     b->time_sent_ns = clock_ns();
     const int err = libusb_submit_transfer(b->time);
     b->times = !err;
@@ -314,11 +318,18 @@ static void ask_time(struct board *b, int64_t now_ns)
         fail_call(b, "asking for the time", err);
 }
 
+static int64_t at_most_a_slice(int64_t ns)
+{
+    return ns < SLICE_MS * MS ? ns : SLICE_MS * MS;
+}
+
 static void keep_up(struct board *b)
 {
     const int64_t now_ns = clock_ns();
-    if (b->ping.waits && now_ns - b->ping.since_ns > ANSWER_MS * MS)
+    if (b->ping.waits && b->awake_ns - b->ping.since_awake_ns > ANSWER_MS * MS)
         fail(b, "it does not answer any more: unplug it and plug it in again");
+    if (b->times && b->awake_ns - b->time_awake_ns > ANSWER_MS * MS)
+        fail(b, "asked for the time it does not answer: it hangs; unplug it and plug it in again");
     if (now_ns > b->report_ns)
         fail(b, "it did not report the shot");
     if (!b->broken && b->command.asked)
@@ -335,12 +346,15 @@ static void *run(void *arg)
 {
     struct board *b = arg;
     prctl(PR_SET_NAME, "rigd-board");
-    while (!b->quit) {
+    for (int64_t last_ns = clock_ns(); !b->quit;) {
+        const int64_t now_ns = clock_ns();
         pthread_mutex_lock(&b->lock);
+        b->awake_ns += at_most_a_slice(now_ns - last_ns);
+        last_ns = now_ns;
         keep_up(b);
-        int64_t pause_ns = b->times || b->broken ? PING_MS * MS : b->time_next_ns - clock_ns();
+        int64_t pause_ns = b->times || b->broken ? SLICE_MS * MS : at_most_a_slice(b->time_next_ns - clock_ns());
         pthread_mutex_unlock(&b->lock);
-        pause_ns = pause_ns < 0 ? 0 : pause_ns > PING_MS * MS ? PING_MS * MS : pause_ns;
+        pause_ns = pause_ns < 0 ? 0 : pause_ns;
         struct timeval t = { 0, (suseconds_t)(pause_ns / 1000) };
         const int err = libusb_handle_events_timeout_completed(b->context, &t, NULL);
         if (err && err != LIBUSB_ERROR_INTERRUPTED) {
@@ -353,18 +367,24 @@ static void *run(void *arg)
     return NULL;
 }
 
-static struct timespec real_time_in(int64_t ns) // as pthread_cond_timedwait() counts with CLOCK_MONOTONIC
+// Under the lock, until something changes. False: that was all the patience there was.
+static bool wait_a_little(struct board *b, int64_t *patience_ns)
 {
-    const int64_t at_ns = clock_ns() + ns;
-    return (struct timespec){ .tv_sec = at_ns / 1000000000, .tv_nsec = at_ns % 1000000000 };
+    const int64_t now_ns = clock_ns(), until_ns = now_ns + at_most_a_slice(*patience_ns);
+    const struct timespec until = { .tv_sec = until_ns / 1000000000, .tv_nsec = until_ns % 1000000000 }; // the condition counts with CLOCK_MONOTONIC
+    if (*patience_ns <= 0)
+        return false;
+    pthread_cond_timedwait(&b->changed, &b->lock, &until);
+    *patience_ns -= at_most_a_slice(clock_ns() - now_ns);
+    return true;
 }
 
 // The loop: one command and its answer. enum proto_error, or -EIO: the link is broken.
 static int ask(struct board *b, uint8_t type, const uint8_t *payload, int n, struct board_said *answer)
 {
     pthread_mutex_lock(&b->lock);
-    const struct timespec until = real_time_in(ANSWER_MS * MS);
-    while (!b->broken && b->command.flies && !pthread_cond_timedwait(&b->changed, &b->lock, &until))
+    int64_t patience_ns = ANSWER_MS * MS;
+    while (!b->broken && b->command.flies && wait_a_little(b, &patience_ns))
         ;
     if (b->command.flies)
         fail(b, "it does not take commands: unplug it and plug it in again");
@@ -376,7 +396,7 @@ static int ask(struct board *b, uint8_t type, const uint8_t *payload, int n, str
         b->command.asked = true;
         libusb_interrupt_event_handler(b->context);
     }
-    while (!b->broken && (b->command.asked || b->command.waits) && !pthread_cond_timedwait(&b->changed, &b->lock, &until))
+    while (!b->broken && (b->command.asked || b->command.waits) && wait_a_little(b, &patience_ns))
         ;
     if (b->command.asked || b->command.waits)
         fail(b, "it does not answer: unplug it and plug it in again");
@@ -763,7 +783,8 @@ static int claim(struct board *b)
         return result == LIBUSB_ERROR_BUSY ? -EBUSY : -ENODEV;
     }
     b->claimed = true;
-    result = libusb_control_transfer(b->device, LIBUSB_ENDPOINT_IN | LIBUSB_REQUEST_TYPE_VENDOR | LIBUSB_RECIPIENT_DEVICE, PROTO_GET_CAPABILITIES, 0, 0, bytes, sizeof(bytes), ANSWER_MS);
+    for (int tries = 0; tries < 2 && (tries == 0 || result == LIBUSB_ERROR_TIMEOUT); tries++)
+        result = libusb_control_transfer(b->device, LIBUSB_ENDPOINT_IN | LIBUSB_REQUEST_TYPE_VENDOR | LIBUSB_RECIPIENT_DEVICE, PROTO_GET_CAPABILITIES, 0, 0, bytes, sizeof(bytes), ANSWER_MS);
     if (result < 0) {
         log_error("trigger: %s: asked what it can do: %s: flash its firmware again (firmware/README.md)", b->where, libusb_strerror(result));
         return -ENODEV;
@@ -783,10 +804,10 @@ static int begin_thread(struct board *b)
     b->time = libusb_alloc_transfer(0);
     if (!b->command.out || !b->ping.out || !b->time)
         return -ENOMEM;
-    libusb_fill_bulk_transfer(b->command.out, b->device, PROTO_ENDPOINT_OUT, b->command.bytes, 0, on_written, b, ANSWER_MS);
-    libusb_fill_bulk_transfer(b->ping.out, b->device, PROTO_ENDPOINT_OUT, b->ping.bytes, 0, on_written, b, ANSWER_MS);
+    libusb_fill_bulk_transfer(b->command.out, b->device, PROTO_ENDPOINT_OUT, b->command.bytes, 0, on_written, b, 0); // no limit of libusb's: keep_up() has one
+    libusb_fill_bulk_transfer(b->ping.out, b->device, PROTO_ENDPOINT_OUT, b->ping.bytes, 0, on_written, b, 0);
     libusb_fill_control_setup(b->time_bytes, LIBUSB_ENDPOINT_IN | LIBUSB_REQUEST_TYPE_VENDOR | LIBUSB_RECIPIENT_DEVICE, PROTO_GET_TIME, 0, 0, 16);
-    libusb_fill_control_transfer(b->time, b->device, b->time_bytes, on_time, b, ANSWER_MS);
+    libusb_fill_control_transfer(b->time, b->device, b->time_bytes, on_time, b, 0);
     libusb_clear_halt(b->device, PROTO_ENDPOINT_OUT); // and both ends begin with the same data toggle
     libusb_clear_halt(b->device, PROTO_ENDPOINT_IN);
     pthread_mutex_lock(&b->lock);
@@ -845,9 +866,9 @@ static int configure(struct board *b)
 
 static int relate_clocks(struct board *b)
 {
-    const struct timespec until = real_time_in(2 * ANSWER_MS * MS);
+    int64_t patience_ns = 2 * ANSWER_MS * MS;
     pthread_mutex_lock(&b->lock);
-    while (!b->broken && b->n_rounds < CLOCK_ROUNDS && !pthread_cond_timedwait(&b->changed, &b->lock, &until))
+    while (!b->broken && b->n_rounds < CLOCK_ROUNDS && wait_a_little(b, &patience_ns))
         ;
     if (!b->broken && b->n_rounds < CLOCK_ROUNDS)
         fail(b, "its clock cannot be made out: %d of %d round trips fit together", b->n_rounds, CLOCK_ROUNDS);

@@ -40,6 +40,7 @@ must() { # the same; without it nothing that follows can hold
     exit 1
 }
 is_running() { case $(cut -d' ' -f3 "/proc/$1/stat" 2>/dev/null) in '' | Z) return 1 ;; esac; } # nobody here may reap orphans
+# Patience is for machines that are too busy: what fails, fails late; what holds costs nothing.
 within() { # tenths of a second, command...
     tenths=$1
     shift
@@ -66,7 +67,7 @@ start_cameras() { # options of rigsim
     $rigsim "$@" >>"$D/sim.log" 2>&1 &
     sim=$!
     sim_is_up() { [ -S "$D/t" ] || ! is_running $sim; }
-    within 200 sim_is_up && [ -S "$D/t" ] && return
+    within 600 sim_is_up && [ -S "$D/t" ] && return
     echo "not ok $((n + 1)) - rigsim starts"
     logs
     echo "1..$((n + 1))"
@@ -85,9 +86,9 @@ is_idle() { # all cameras ready and nothing under way
     "$BIN/rigctl" --json status >"$D/status" 2>/dev/null && grep -q "\"n_ready\":$CAMERAS," "$D/status" && grep -q '"busy":false' "$D/status" &&
         ! "$BIN/rigctl" takes 2>/dev/null | grep -qE ' (armed|exposing|collecting) '
 }
-ready() { # within a minute
+ready() { # within three minutes: a camera that fell silent is tried again every minute
     idle_or_gone() { is_idle || ! is_running "$rigd"; }
-    within 600 idle_or_gone && is_running "$rigd" && return
+    within 1800 idle_or_gone && is_running "$rigd" && return
     cat "$D/status"
     return 1
 }

@@ -31,11 +31,11 @@ start_cameras
 rigd=$! # in the end, boardsim is what has to end
 status() { "$BIN/rigctl" --json status >"$D/status" 2>/dev/null && grep -q "$1" "$D/status"; }
 idle() { status "\"n_ready\":$CAMERAS," && grep -q '"busy":false' "$D/status" && grep -q '"trigger":"usb"' "$D/status"; }
-board_ready() { ready && within 300 idle || { cat "$D/status"; return 1; }; }
+board_ready() { ready && within 900 idle || { cat "$D/status"; return 1; }; }
 verified() { [ "$(cat "$D"/takes/*/take.json 2>/dev/null | grep -c '"state":"verified"')" = "$1" ]; }
 press() { # and the take that follows: the how-manieth
     kill -USR1 $rigd
-    within 150 verified "$1"
+    within 900 verified "$1"
 }
 spread_us() { # of the latest take
     "$BIN/rigctl" --json report "$(ls "$D/takes" | tail -1)" | tr ',{}' '\n\n\n' | sed -n 's/.*"spread_ms":\([0-9.]*\).*/\1/p' | awk '{ print int(1000 * $1) }'
@@ -55,25 +55,28 @@ echo "# spread ${before:-?} us before calibration, ${after:-?} us after"
 check "then the shutters open together" test "${after:-99999}" -lt 600 -a "${before:-0}" -gt 5000
 check "no command, edge or stamp was out of order" sh -c "! grep -E 'error|warning: (trigger|boardsim)' $D/rigd.log"
 kill -USR2 $rigd
-check "the cable falls out: rigd says that the trigger is gone" within 30 status '"trigger":"\(broken\|not there\)"'
+check "the cable falls out: rigd says that the trigger is gone" within 600 status '"trigger":"\(broken\|not there\)"'
 check "plugged in again it is found again" board_ready
 check "and the button works again" press 3
 check "ready a third time" board_ready
 check "it says what a press would do" status '"button":"takes"'
 "$BIN/rigctl" capture --on-button --name armed >"$D/armed" 2>&1 &
 armed=$!
-check "armed, it says that the next press fires" within 150 status '"state":"armed".*"button":"fires"'
+check "armed, it says that the next press fires" within 600 status '"state":"armed".*"button":"fires"'
 check "a take from here is refused, and why is said" sh -c "! $BIN/rigctl capture 2>&1 | grep -q verified; $BIN/rigctl status | grep 'armed: the trigger'"
 check "the board fires, and its frames are fetched" press 4
 check "who armed it has the answer" wait $armed
 check "ready a fourth time" board_ready
 "$BIN/rigctl" capture --on-button --name cancelled >"$D/armed" 2>&1 &
 armed=$!
-check "armed once more" within 150 status '"button":"fires"'
+check "armed once more" within 600 status '"button":"fires"'
 check "cancelled, it is disarmed at once" sh -c "$BIN/rigctl cancel"
-check "with no frame, and a reason" sh -c "! wait $armed; sleep .5; grep -q 'the button was not pressed' $D/armed $D/takes/*cancelled/take.json"
+refused() { ! wait $armed; }
+check "who armed it hears no" refused
+why_not() { grep -q 'the button was not pressed' "$D/armed" "$D"/takes/*cancelled/take.json; }
+check "with no frame, and a reason" within 600 why_not
 ended() { ! is_running $rigd; }
 kill $rigd
-check "rigd ends when asked to" within 30 ended
+check "rigd ends when asked to" within 600 ended
 echo "1..$n"
 exit $failed

@@ -204,9 +204,9 @@ static void a_supply_comes_back_by_itself(void **state)
     look_at_edges();
     assert_int_equal(trigger_relay(trigger, 2, true), 0);
     assert_int_equal(trigger_relay(trigger, 3, true), 0);
-    usleep(50000);
+    wait_ms(50);
     assert_int_equal(trigger_relay(trigger, 3, false), 0);
-    usleep(1150000);
+    wait_ms(1150);
     look_at_edges();
     int64_t on_ns, off_ns;
     assert_true(pulse(16 + 2, &on_ns, &off_ns));
@@ -246,7 +246,7 @@ static int led_changes(int ms)
 {
     int n = 0;
     bool was = live_board_led(live);
-    for (const int64_t end_ns = clock_ns() + ms * MS; clock_ns() < end_ns; usleep(5000)) {
+    for (const int64_t end_ns = clock_ns() + ms * MS; clock_ns() < end_ns; wait_ms(5)) {
         const bool is = live_board_led(live);
         n += is != was;
         was = is;

@@ -398,10 +398,13 @@ static void a_kill_at_any_time_leaves_whole_files_or_none(void **state)
     size_t n_whole, n;
     char raw[600], out[600], tif[600], program[600];
     raw_write(scratch_path("a.dng"), &info, raw_scatter, NULL);
-    clock_gettime(CLOCK_MONOTONIC, &began);
-    assert_int_equal(run(NULL, "$BIN/rigd-develop --tiff $D/a.dng $D/a.exr >/dev/null"), 0);
-    clock_gettime(CLOCK_MONOTONIC, &ended);
-    const double whole_ns = 1e9 * (double)(ended.tv_sec - began.tv_sec) + (double)(ended.tv_nsec - began.tv_nsec);
+    double whole_ns = INFINITY;
+    for (int k = 0; k < 3; k++) { // the shortest: a machine that stood still would have us kill after the end
+        clock_gettime(CLOCK_MONOTONIC, &began);
+        assert_int_equal(run(NULL, "$BIN/rigd-develop --tiff $D/a.dng $D/a.exr >/dev/null"), 0);
+        clock_gettime(CLOCK_MONOTONIC, &ended);
+        whole_ns = fmin(whole_ns, 1e9 * (double)(ended.tv_sec - began.tv_sec) + (double)(ended.tv_nsec - began.tv_nsec));
+    }
     char *whole = slurp(scratch_path("a.exr"), &n_whole);
     assert_non_null(whole);
     snprintf(raw, sizeof(raw), "%s/a.dng", scratch_dir);

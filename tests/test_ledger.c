@@ -430,6 +430,28 @@ static void what_rotted_on_disk_is_noticed_set_aside_and_fetched_again(void **st
     log_set_level(LOG_INFO);
 }
 
+// A daemon that is killed while it writes down how far a verified take was processed: nobody reconciles that one any more.
+static void half_a_ledger_of_a_finished_take_is_swept_at_the_next_start(void **state)
+{
+    static const char *const names[] = { "raw/B01.nef.part", ".take.json.7gXk2a.part", ".processing.json.7gXk2a.part" }; // others' are theirs
+    char path[3][1100];
+    (void)state;
+    assert_int_equal(whole_story(), 0);
+    for (int i = 0; i < 3; i++) {
+        snprintf(path[i], sizeof(path[i]), "%s/%s", take_dir, names[i]);
+        const int fd = open(path[i], O_WRONLY | O_CREAT, 0644);
+        assert_true(fd >= 0);
+        close(fd);
+    }
+    ledger_remove_leftovers(takes);
+    for (int i = 0; i < 3; i++)
+        assert_int_equal(access(path[i], F_OK), i == 1 ? -1 : 0);
+    for (int i = 0; i < 3; i += 2)
+        unlink(path[i]);
+    check_whole();
+    remove_take();
+}
+
 static void exposures_are_called_as_on_dials(void **state)
 {
     (void)state;
@@ -665,6 +687,7 @@ int main(void)
         cmocka_unit_test(a_ledger_reads_back_as_it_was_written),
         cmocka_unit_test(a_stage_made_anew_replaces_the_one_before_and_old_ledgers_have_none),
         cmocka_unit_test(a_panorama_s_ledger_reads_back_as_it_was_written),
+        cmocka_unit_test(half_a_ledger_of_a_finished_take_is_swept_at_the_next_start),
         cmocka_unit_test(exposures_are_called_as_on_dials),
         cmocka_unit_test(killed_at_every_call_a_take_is_finished_by_the_next_start),
         cmocka_unit_test(a_full_or_failing_disk_costs_no_frame),

@@ -42,7 +42,6 @@ check "preflight finds them fit" "$BIN/rigctl" preflight
 check "a take from request to verified" "$BIN/rigctl" capture --name first
 check "it says how far apart the shutters opened" sh -c "$BIN/rigctl report \$(ls $D/takes) | grep 'shutters: spread'"
 check "a second rigd on the same socket is refused" sh -c "! $BIN/rigd --config $D/rigd.conf --socket $D/s"
-check "lag is measured" "$BIN/rigctl" calibrate lag --shots 3
 check "a camera that nobody knows is refused" sh -c "! $BIN/rigctl identify Z99"
 check "a trigger without a light says so" sh -c "$BIN/rigctl identify board 2>&1 | grep 'has no light'"
 check "doctor looks at this machine" sh -c "$BIN/rigctl doctor; [ \$? -le 1 ]"
@@ -68,9 +67,11 @@ while [ $k -lt "$KILLS" ]; do
 done
 check "$KILLS kills of daemon or worker: it is ready again" test $k = "$KILLS"
 check "no frame is lost, doubled or half there" accounts
+# Not before: with delays a kill may fall between the shutters of two bodies, and a take of which some were pressed and some never.
+check "lag is measured" "$BIN/rigctl" calibrate lag --shots 3
 gone() { ! is_running "$rigd"; }
 kill "$rigd"
-check "it ends when asked to" within 30 gone
+check "it ends when asked to" within 600 gone
 # Ours are known by the socket in their environment: a test beside this one kills its daemon, too, and has a camera A01. Who was killed
 # with its daemon may take a moment to be gone.
 no_worker() {
@@ -79,6 +80,6 @@ no_worker() {
     done
     return 0
 }
-check "no worker is left" within 30 no_worker
+check "no worker is left" within 600 no_worker
 echo "1..$n"
 exit $failed

@@ -45,7 +45,7 @@ accounts() {
 start_cameras
 start
 must "all cameras open" ready
-check "a panorama from request to verified" sh -c "timeout 120 $BIN/rigctl panorama --name first 2>$D/steps"
+check "a panorama from request to verified" sh -c "timeout 600 $BIN/rigctl panorama --name first 2>$D/steps"
 check "it says each step" sh -c "cat $D/steps; grep -q 'stop 2 of 2: to yaw 45' $D/steps && grep -q 'stop 1 of 2: exposure 1, 1/1000 s' $D/steps && grep -q 'stop 2 of 2 is done' $D/steps"
 check "its frames and its plan are here" accounts
 check "it becomes an EXR without any daemon" sh -c "$BIN/rigctl panorama --merge $(newest first) -o $D/p.exr --json >$D/report; s=\$?; cat $D/report; [ \$s = 0 -o \$s = 3 ] && [ -s $D/p.exr ]"
@@ -68,7 +68,7 @@ wait "$sim" "$rigd" 2>/dev/null
 start_cameras --faults "$D/faults"
 start
 must "it opens them again" ready
-check "a closed shutter, a lost event, a turned dial, a stuck head, a broken link: it is whole" sh -c "timeout 150 $BIN/rigctl panorama --name faults 2>$D/steps"
+check "a closed shutter, a lost event, a turned dial, a stuck head, a broken link: it is whole" sh -c "timeout 600 $BIN/rigctl panorama --name faults 2>$D/steps"
 check "each is said" sh -c "cat $D/steps; grep -q 'exposed again' $D/steps && grep -q 'head did not reach' $D/steps && grep -q 'aperture' $D/steps"
 check "and every exposure is here" accounts
 echo "1..$n"

@@ -4,18 +4,20 @@
 set -u
 . tests/commands_setup.sh
 rigctl=${BIN:-build/bin}/rigctl
-# A line is said to who has subscribed, "sleep S" is silence; then the answer.
+# A line is said to who has subscribed, "sleep S" is silence, "until TEXT" is silence until rigctl has said that; then the answer.
 daemon() {
     rm -f "$dir/s"
+    : >"$dir/log"
     exec 3<&0 # what runs beside the shell has no standard input
-    perl -MIO::Socket::UNIX -MTime::HiRes=sleep -e '$l = IO::Socket::UNIX->new(Local => shift, Listen => 1) or die; alarm 60; $c = $l->accept;
+    perl -MIO::Socket::UNIX -MTime::HiRes=sleep -e '($s, $log) = @ARGV; $l = IO::Socket::UNIX->new(Local => "$s.new", Listen => 1) or die; rename "$s.new", $s; alarm 300; $c = $l->accept;
+        sub says { open(my $f, "<", $log) or return; grep { index($_, $_[0]) >= 0 } <$f> }
         while (defined($_ = <$c>)) { $told |= /"do":"subscribe"/; last if /"id":1[,}]/ }
-        while (<STDIN>) { if (/^sleep (.*)/) { sleep $1 } elsif ($told) { $c->print($_); $c->flush } }
-        $c->print("{\"v\":1,\"id\":1,\"ok\":true,\"result\":{\"id\":\"t\",\"state\":\"verified\",\"steps\":[],\"lag\":[]}}\n"); 1 while <$c>' "$dir/s" <&3 &
+        while (<STDIN>) { if (/^sleep (.*)/) { sleep $1 } elsif (/^until (.*)/) { my $text = $1; for (1 .. 1200) { last if says($text); sleep .05 } } elsif ($told) { $c->print($_); $c->flush } }
+        $c->print("{\"v\":1,\"id\":1,\"ok\":true,\"result\":{\"id\":\"t\",\"state\":\"verified\",\"steps\":[],\"lag\":[]}}\n"); 1 while <$c>' "$dir/s" "$dir/log" <&3 &
     served=$!
     exec 3<&-
     tries=0
-    until [ -S "$dir/s" ] || [ $tries = 100 ]; do tries=$((tries + 1)); sleep .1; done
+    until [ -S "$dir/s" ] || [ $tries = 600 ]; do tries=$((tries + 1)); sleep .1; done
 }
 # says NAME PATTERN COMMAND...: rigctl, in a pipe, ends well, and a line of what it said meanwhile is like that
 says() {
@@ -29,7 +31,7 @@ says() {
 
 daemon <<'E1'
 {"v":1,"event":"panorama","body":{"step":"turn","stop":2,"n_stops":4,"yaw_deg":120,"pitch_deg":-20}}
-sleep 2.2
+until to yaw 120, pitch -20: for
 {"v":1,"event":"prompt","body":{"on":true,"text":"look after the head"}}
 sleep 2.2
 E1
@@ -42,13 +44,13 @@ daemon <<'E2'
 {"v":1,"event":"progress","body":{"take":"t","step":"standard","stage":"materials","done":6,"total":8}}
 sleep .1
 {"v":1,"event":"progress","body":{"take":"t","step":"standard","stage":"materials","done":8,"total":8}}
-sleep 2.2
+until standard: after materials
 E2
 says "what a step said last is told though it is silent now, and not as if it went on" '^  standard: after materials$' process t --watch
 
 daemon <<'E3'
 {"v":1,"event":"say","body":{"severity":"info","text":"lag: shot 1 of 5"}}
-sleep 2.2
+until calibrate: for
 E3
 says "a calibration says its shots, in a pipe too" '^  info: lag: shot 1 of 5$' calibrate lag
 grep -qE '^  calibrate: for [0-9]+ s$' "$dir/log"

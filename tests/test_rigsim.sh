@@ -26,7 +26,7 @@ address=127.$((1 + ($$ >> 16 & 127))).$(($$ >> 8 & 255)).$(($$ & 255)) # nobody 
 start() { # options
     "$BIN/rigsim" --cameras 2 --address $address --raw-size 640x480 "$@" 2>"$work/log" &
     pid=$!
-    for wait in $(seq 400); do
+    for wait in $(seq 1200); do
         grep -q 'cameras (' "$work/log" && return
         kill -0 $pid 2>/dev/null || break
         sleep .05
@@ -42,11 +42,18 @@ stop() {
     pid=
     return $status
 }
-g() { (cd "$work/files" && HOME="$work/home" timeout 60 gphoto2 --port ptpip:$address:15740:15741 "$@" 2>&1); }
+g() { (cd "$work/files" && HOME="$work/home" timeout 300 gphoto2 --port ptpip:$address:15740:15741 "$@" 2>&1); }
 says() { # text, gphoto2's options
     text=$1
     shift
     g "$@" | tee "$work/out" | grep -qF -- "$text"
+}
+eventually() { # the second file is late
+    for try in $(seq 100); do
+        "$@" && return
+        sleep .1
+    done
+    return 1
 }
 fresh() {
     rm -rf "$work/home" "$work/files"
@@ -94,8 +101,7 @@ story() { # personality, model, key of the aperture, its value, key and value of
     fi
     g --delete-all-files --folder "$folder" >/dev/null
     check "$personality: RAW+JPEG gives two files" g --set-config "$format=$both" --set-config capturetarget=1 --capture-image
-    sleep .4 # the second file is late
-    check "$personality: both on the card" says "There are 2 files in folder '$folder'" --list-files
+    check "$personality: both on the card" eventually says "There are 2 files in folder '$folder'" --list-files
     check "$personality: and both can be had" g --get-all-files
     check "$personality: the JPEG is one" sh -c "od -An -tx1 -N3 $work/files/*.JPG | grep -q 'ff d8 ff'"
     check "$personality: --delete-file" g --delete-file 1 --folder "$folder"

@@ -22,7 +22,7 @@
 #define ASK(c, code, ...) \
     client_ask(c, code, (int)(sizeof((uint32_t[]){ __VA_ARGS__ }) / 4), (uint32_t[]){ __VA_ARGS__ }, NULL, 0)
 enum { OK = 0x2001, BUSY = 0x2019, GET_OBJECT = 0x1009, GET_HANDLES = 0x1007, CAPTURE = 0x100e, GET_PROPERTY = 0x1015,
-       FOLDER = 0x00010002, PATIENCE_MS = 20000, PORT = 15740 };
+       FOLDER = 0x00010002, PATIENCE_MS = 120000, PORT = 15740 };
 
 static pid_t rigsim;
 
@@ -66,7 +66,7 @@ static void start(int n_cameras, const char *faults, const char *const *options)
         execv(bin, (char *const *)(uintptr_t)argv);
         _exit(127);
     }
-    for (int i = 0; i < 400; i++) { // until the last camera listens
+    for (int i = 0; i < PATIENCE_MS / 10; i++) { // until the last camera listens
         struct client c;
         if (!client_open(&c, loopback_address(), PORT + 2 * (n_cameras - 1), PATIENCE_MS)) {
             client_close(&c);
@@ -94,12 +94,6 @@ static void stop(void)
     rigsim = 0;
     assert_true(WIFEXITED(status) && WEXITSTATUS(status) == 0);
     scratch_empty();
-}
-
-static void wait_until(int64_t at_ns)
-{
-    while (now_ns() < at_ns)
-        sleep_ms(2);
 }
 
 // The n-th file (from 0) once it is there; 0 never.
@@ -184,13 +178,13 @@ static void eighty_five_cameras_deliver_8_mb_each_at_once_and_the_same_again(voi
     }
 }
 
-// Of rigsim, once they are at most wanted, or after a second.
-static int open_files(int wanted)
+// Of rigsim, once they are at most wanted, or after so long.
+static int open_files(int wanted, int patience_ms)
 {
     char path[64];
     int n = 0;
     snprintf(path, sizeof(path), "/proc/%d/fd", rigsim);
-    for (int tries = 0; tries < 200; tries++, sleep_ms(5)) {
+    for (int tries = 0; tries < patience_ms / 5; tries++, sleep_ms(5)) {
         DIR *dir = opendir(path);
         assert_non_null(dir);
         for (n = 0; readdir(dir); n++)
@@ -206,14 +200,14 @@ static void many_clients_one_after_another_leave_nothing_behind(void **state)
 {
     (void)state;
     start(1, NULL, (const char *[]){ "--raw-size", "64x48", NULL });
-    const int before = open_files(0);
+    const int before = open_files(0, 1000); // start()'s own client has left, too
     for (int i = 0; i < 300; i++) {
         struct client c;
         assert_int_equal(client_open(&c, loopback_address(), PORT, PATIENCE_MS), 0);
         assert_int_equal(ASK(&c, GET_PROPERTY, 0x5001), OK);
         client_close(&c);
     }
-    assert_int_equal(open_files(before), before);
+    assert_true(open_files(before, PATIENCE_MS) <= before);
     stop();
 }
 
@@ -288,6 +282,8 @@ static void reports(int fd, int n, struct shutter_line *by_channel)
     struct shutter_line r[SHUTTER_LINE_PER_PACKET];
     while (n > 0) {
         const ssize_t bytes = recv(fd, r, sizeof(r), 0);
+        if (bytes < 0 && errno == EINTR) // with a timeout: this process was stopped for a while
+            continue;
         assert_true(bytes > 0);
         for (size_t i = 0; i < (size_t)bytes / sizeof(r[0]); i++, n--)
             by_channel[r[i].channel] = r[i];
@@ -372,11 +368,14 @@ static void a_pressed_body_is_silent_until_its_host_dies(void **state)
     struct client c;
     snprintf(path, sizeof(path), "%s/lines", scratch_dir);
     start(1, NULL, (const char *[]){ "--raw-size", "64x48", "--trigger-socket", path, NULL });
-    assert_int_equal(client_open(&c, loopback_address(), PORT, 300), 0);
+    assert_int_equal(client_open(&c, loopback_address(), PORT, PATIENCE_MS), 0);
     const int fd = lines_open(path);
     set_line(fd, SHUTTER_LINE_HALF, 1, 0, 0, 0);
-    sleep_ms(100);
-    assert_int_equal(ASK(&c, GET_PROPERTY, 0x5001), -ETIMEDOUT);
+    c.timeout_ms = 300;
+    int got = OK;
+    for (const int64_t end = now_ns() + PATIENCE_MS * MS; got == OK && now_ns() < end;) // until it has noticed
+        got = ASK(&c, GET_PROPERTY, 0x5001);
+    assert_int_equal(got, -ETIMEDOUT);
     close(fd);
     c.timeout_ms = PATIENCE_MS; // now it answers that question, and the next
     c.transaction--;
@@ -420,7 +419,7 @@ static void faults_strike_their_camera_and_no_other(void **state)
     (void)state;
     static const char script[] = "A01 on op 0x100e#1 busy 400ms\n"
                                  "A02 on op 0x1015#2 stall 500ms\n"
-                                 "A03 on op 0x1015#1 refuse 400ms\n"
+                                 "A03 on op 0x1015#1 refuse 2s\n"
                                  "A04 on connect * lose_added 1\n"
                                  "A05 on connect * corrupt 1\n"
                                  "A06 on connect * short 1\n"
@@ -435,25 +434,24 @@ static void faults_strike_their_camera_and_no_other(void **state)
     // busy, for its time
     int64_t from = now_ns();
     assert_int_equal(ASK(&c[0], CAPTURE, 0, 0), BUSY);
-    int n_busy = 0;
-    while (ASK(&c[0], CAPTURE, 0, 0) == BUSY && now_ns() < from + PATIENCE_MS * MS) {
-        n_busy++;
+    while (ASK(&c[0], CAPTURE, 0, 0) == BUSY && now_ns() < from + PATIENCE_MS * MS)
         sleep_ms(5);
-    }
-    assert_true(n_busy > 1 && now_ns() - from >= 400 * MS);
+    assert_true(now_ns() - from >= 400 * MS);
     assert_true(file(&c[0], 0) != 0);
     // stalled: the answer comes, late
     assert_int_equal(ASK(&c[1], GET_PROPERTY, 0x5001), OK);
-    assert_int_equal(ASK(&c[1], GET_PROPERTY, 0x5001), OK);
     from = now_ns();
+    assert_int_equal(ASK(&c[1], GET_PROPERTY, 0x5001), OK); // when it begins
     assert_int_equal(ASK(&c[1], GET_PROPERTY, 0x5001), OK);
-    assert_true(now_ns() - from >= 400 * MS);
+    assert_true(now_ns() - from >= 500 * MS);
     // refused, then back
     assert_int_equal(ASK(&c[2], GET_PROPERTY, 0x5001), -EPIPE);
     client_close(&c[2]);
     assert_int_equal(client_open(&c[2], loopback_address(), PORT + 4, PATIENCE_MS), -ECONNREFUSED);
-    wait_until(now_ns() + 450 * MS);
-    assert_int_equal(client_open(&c[2], loopback_address(), PORT + 4, PATIENCE_MS), 0);
+    int err = -ECONNREFUSED;
+    for (const int64_t end = now_ns() + PATIENCE_MS * MS; err == -ECONNREFUSED && now_ns() < end; sleep_ms(20))
+        err = client_open(&c[2], loopback_address(), PORT + 4, PATIENCE_MS);
+    assert_int_equal(err, 0);
     // the event is lost, the file is not
     assert_int_equal(ASK(&c[3], CAPTURE, 0, 0), OK);
     assert_int_equal(client_event(&c[3], &code, &value), 0);
@@ -492,10 +490,12 @@ static void hostile_replies_never_hang_a_careful_client(void **state)
     start(10, script, NULL);
     for (int i = 0; i < 10; i++) {
         struct client c;
-        assert_int_equal(client_open(&c, loopback_address(), PORT + 2 * i, 500), 0);
+        const bool is_sound = i == 3 || i == 4 || i == 8; // a packet with wrong content
+        assert_int_equal(client_open(&c, loopback_address(), PORT + 2 * i, PATIENCE_MS), 0);
+        c.timeout_ms = is_sound ? PATIENCE_MS : 500;
         const int got = ASK(&c, 0x1005, 0x00010001);
-        if (i == 3 || i == 4 || i == 8)
-            assert_int_equal(got, OK); // a sound packet with wrong content
+        if (is_sound)
+            assert_int_equal(got, OK);
         else
             assert_true(got == -EPROTO || got == -ETIMEDOUT || got == -EPIPE);
         client_close(&c);
@@ -518,10 +518,11 @@ static void a_flood_of_events_drowns_no_answer(void **state)
     assert_int_equal(client_open(&c, loopback_address(), PORT, PATIENCE_MS), 0);
     assert_int_equal(ASK(&c, CAPTURE, 0, 0), OK);
     assert_true(file(&c, 0) != 0);
-    c.timeout_ms = 300;
-    while (!client_event(&c, &code, &value))
+    while (n < 1000 + 2 && !client_event(&c, &code, &value)) // and the two of the shot
         n++;
-    assert_int_equal(n, 1000 + 2); // and the two of the shot
+    assert_int_equal(n, 1000 + 2);
+    c.timeout_ms = 300;
+    assert_int_equal(client_event(&c, &code, &value), -ETIMEDOUT);
     client_close(&c);
     stop();
 }

@@ -78,7 +78,10 @@ static void hear(struct worker *w)
 {
     static char text[CAMERA_MESSAGE_MAX];
     struct pollfd p = { .fd = w->fd, .events = POLLIN };
-    if (poll(&p, 1, 40000) != 1)
+    int n_ready;
+    while ((n_ready = poll(&p, 1, 180000)) < 0 && errno == EINTR)
+        ;
+    if (n_ready != 1)
         fail_msg("the worker hangs");
     const ssize_t n = recv(w->fd, text, sizeof(text), 0);
     if (n <= 0)
@@ -277,7 +280,7 @@ static void pulled_out_in_a_download_nothing_is_half_there_and_the_frame_comes_a
     const struct camera_object o = shoot(&w);
     usb_camera_pause_after(camera, 1 << 20);
     send_command(&w, fetching(CAMERA_FETCH, &o, "A01.dng"));
-    assert_true(usb_camera_wait_paused(camera, 10000));
+    assert_true(usb_camera_wait_paused(camera, 60000));
     usb_camera_unplug(camera);
     expect_failure(&w, CAMERA_LOST, "cable");
     assert_nothing_is_left();
@@ -318,7 +321,7 @@ static void after_a_killed_worker_the_next_one_fetches_the_frame(void **state)
     const struct camera_object o = shoot(&w);
     usb_camera_pause_after(camera, 1 << 20);
     send_command(&w, fetching(CAMERA_FETCH, &o, "A01.dng"));
-    assert_true(usb_camera_wait_paused(camera, 10000));
+    assert_true(usb_camera_wait_paused(camera, 60000));
     kill(w.pid, SIGKILL);
     waitpid(w.pid, NULL, 0);
     close(w.fd);
@@ -416,7 +419,7 @@ static void a_take_of_the_daemon_survives_a_pulled_cable(void **state)
         execl("/bin/sh", "sh", "-c", command, NULL);
         _exit(127);
     }
-    const bool is_halfway = usb_camera_wait_paused(camera, 15000);
+    const bool is_halfway = usb_camera_wait_paused(camera, 120000);
     if (is_halfway) {
         usb_camera_unplug(camera);
         assert_int_equal(usb_camera_plug(camera, 5), 0);

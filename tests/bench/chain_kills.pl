@@ -31,7 +31,7 @@ my $CAMERAS = 6; # and one on the panorama head
 my $OPTIONS = '--texture 16 --lights 16 --sub-lights 1 --material-lights 64 --bounces 0 --hold-out every:6';
 my $STOPS = $ENV{STOPS} // '0,0; 180,0'; # of the panorama head
 my @TAKES = (qw(vase bowl))[0 .. ($ENV{TAKES} // 2) - 1];
-my $ROUND_S = 240; # longer, and it hangs
+my $ROUND_S = 900; # longer, and it hangs
 my $address = sprintf '127.%d.%d.%d', 1 + ($$ >> 16 & 127), $$ >> 8 & 255, $$ & 255; # tests/loopback.h
 my $home = tempdir('studiorig-bench-XXXXXX', DIR => -w '/dev/shm' ? '/dev/shm' : $ENV{TMPDIR} // '/tmp', CLEANUP => !$ENV{KEEP});
 my $HAS_GPHOTO2 = system('command -v gphoto2 >/dev/null') == 0;
@@ -101,9 +101,9 @@ sub new_rig {
     spew("$d/rigd.conf", "[rig]\nname = kills\ntakes = $d/takes\nstate = $d/state\nsocket = $d/s\npersonality_dir = $CONFIG\nraw_mb = 1\nfree_space_mb = 1\ncollect_timeout_ms = 3000\n"
         . "[settings]\nimageformat = raw\niso = 100\naperture = 8\nshutter = 1/60\n[develop]\nafter = on\n[reconstruct]\n$geometry\n[solve]\npreview = on\nthen = standard\nthreads = 2\noptions = $OPTIONS\n$list");
     $r->{sim} = launch("$d/sim.log", @sim);
-    for (my $end = time + 20; !-S "$d/wires"; sleep .02) {
+    for (my $end = time + 120; !-S "$d/wires"; sleep .02) {
         die "rigsim ended: " . slurp("$d/sim.log") if waitpid($r->{sim}, WNOHANG);
-        die "rigsim is not there after 20 s\n" if time > $end;
+        die "rigsim is not there after two minutes\n" if time > $end;
     }
     start_rigd($r);
     return $r;
@@ -338,7 +338,7 @@ sub audit {
     $complain->("no card could be read") if $HAS_GPHOTO2 && !$n;
     kill 'TERM', $r->{sim};
     reap($r->{sim});
-    for (my $end = time + 3; ; sleep .1) { # of this rig, still there?
+    for (my $end = time + 60; ; sleep .1) { # of this rig, still there?
         my @left = grep { m{/(\d+)/} && $1 != $$ && (slurp($_) // '') =~ /RIGD_SOCKET=\Q$r->{dir}\E\/s\0/ && is_alive($1) } glob '/proc/[0-9]*/environ';
         last if !@left;
         if (time > $end) { $complain->('still running: ' . join ' ', map { m{/(\d+)/}; (stat_of($1))[0] . " ($1)" } @left); last }

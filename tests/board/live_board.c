@@ -1,6 +1,7 @@
 // tests/board/live_board.c - see live_board.h.
 #if __has_include(<umockdev.h>) && __has_include(<simavr/sim_avr.h>)
 #include "tests/board/live_board.h"
+#include "tests/board/board_time.h"
 
 #include <errno.h>
 #include <pthread.h>
@@ -98,10 +99,10 @@ static void run_until(struct live_board *l, uint64_t cycle)
 static bool keep_pace(struct live_board *l)
 {
     const uint64_t now = simavr_board_cycle(l->board), due = cycle_of(l, clock_ns());
-    if (now >= due)
-        return now < due + CHUNK / 8;
-    run_until(l, due - now < BURST ? due : now + BURST);
-    return due - now < BURST;
+    if (now < due)
+        run_until(l, due - now < BURST ? due : now + BURST);
+    board_time_reached(ns_of(l, simavr_board_cycle(l->board)));
+    return now < due ? due - now < BURST : now < due + CHUNK / 8;
 }
 
 static void *pace(void *arg)
@@ -246,8 +247,10 @@ int live_board_open(struct live_board **out, const char *image, double fast_ppm,
     l->arg = arg;
     l->hz = SIMAVR_HZ * (1 + 1e-6 * fast_ppm);
     l->start_ns = clock_ns();
+    board_time_reached(l->start_ns);
     l->board = simavr_board_open(image, &watch);
     if (!l->board) {
+        board_time_reached(INT64_MAX);
         free(l->edge);
         free(l);
         return -ENOENT;
@@ -267,6 +270,7 @@ void live_board_close(struct live_board *l)
     l->quit = true;
     pthread_mutex_unlock(&l->lock);
     pthread_join(l->thread, NULL);
+    board_time_reached(INT64_MAX);
     simavr_board_close(l->board);
     pthread_mutex_destroy(&l->lock);
     free(l->edge);

@@ -3,7 +3,7 @@
 //
 // Its cycles are CLOCK_MONOTONIC's, times (1 + fast_ppm), from the start on: a transfer begins when the core has come as far as the
 // clock has, neither before nor, while this machine is busy, after. simavr runs several times faster than the chip, so that it catches
-// up. So the true relation of both clocks is known, to the cycle, and what rigd believes can be compared with it.
+// up; in tests time waits for it (board_time.h). So the true relation of both clocks is known, to the cycle, and what rigd believes can be compared with it.
 #pragma once
 #include "tests/board/simavr_board.h"
 #include "tests/usb/usbfs.h"

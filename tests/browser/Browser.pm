@@ -53,7 +53,7 @@ sub call {
     my %m = (id => ++$self->{id}, method => $method, params => $params // {});
     $m{sessionId} = $self->{session} if $self->{session};
     print { $self->{out} } encode_json(\%m), "\0";
-    while (my $m = $self->message(30)) {
+    while (my $m = $self->message(180)) {
         if (($m->{id} // 0) == $m{id}) {
             die "$method: $m->{error}{message}\n" if $m->{error};
             return $m->{result};
@@ -74,7 +74,7 @@ sub js { # the value of an expression; a promise is awaited
 
 sub until_true { # does the expression become true?
     my ($self, $expression, $seconds) = @_;
-    for (my $end = time + ($seconds // 20); time < $end; sleep .05) {
+    for (my $end = time + ($seconds // 120); time < $end; sleep .05) {
         return 1 if eval { $self->js("!!($expression)") };
     }
     return 0;

@@ -26,14 +26,14 @@ sub new {
 sub up {
     my ($self, $which, $is_there) = @_;
     my $program = { sim => 'rigsim', rigd => 'rigd' }->{$which};
-    for (my $end = time + 20; time < $end; sleep .05) {
+    for (my $end = time + 120; time < $end; sleep .05) {
         return if $is_there->();
         if (waitpid($self->{$which}, POSIX::WNOHANG)) {
             delete $self->{$which};
             die "# $program has ended\n", $self->logs;
         }
     }
-    die "# $program is not there after 20 s\n", $self->logs;
+    die "# $program is not there after two minutes\n", $self->logs;
 }
 
 # The end of what both said, as comments of TAP.

@@ -300,7 +300,11 @@ int usbfs_new(struct usbfs **out, UMockdevTestbed *bed, const struct usbfs_ops *
     if (!u)
         return -ENOMEM;
     pthread_mutex_init(&u->lock, NULL);
-    pthread_cond_init(&u->changed, NULL);
+    pthread_condattr_t attributes;
+    pthread_condattr_init(&attributes);
+    pthread_condattr_setclock(&attributes, CLOCK_MONOTONIC);
+    pthread_cond_init(&u->changed, &attributes);
+    pthread_condattr_destroy(&attributes);
     u->bed = bed;
     u->ops = ops;
     u->device = device;
@@ -333,8 +337,8 @@ int usbfs_free(struct usbfs *u)
         return 0;
     if (u->path)
         usbfs_unplug(u);
-    clock_gettime(CLOCK_REALTIME, &until);
-    until.tv_sec += 5;
+    clock_gettime(CLOCK_MONOTONIC, &until);
+    until.tv_sec += 60;
     pthread_mutex_lock(&u->lock);
     while (u->n_clients && !pthread_cond_timedwait(&u->changed, &u->lock, &until))
         continue;
