@@ -392,7 +392,7 @@ static void a_frame_behind_many_folders_is_found_or_the_card_is_refused(void **s
 {
     (void)state;
     static const struct { const char *base, *conf; int n_folders; } cards[] = {
-        { "nikon", "nikon", 600 }, { "canon", "canon-eos", 600 }, { "generic", "generic", 600 }, { "nikon", "nikon", 5000 }, { "generic", "generic", 5000 },
+        { "nikon", "nikon", 600 }, { "generic", "generic", 5000 },
     };
     for (size_t k = 0; k < sizeof(cards) / sizeof(cards[0]); k++) {
         struct sim s;
