@@ -4,6 +4,7 @@
 // compared with what the frames before it predict, block by block, before it is taken in: the ratio of brightness is the test of its
 // exposure, what remains in a block is movement or flicker.
 #include "rigd/bracket.h"
+#include "rigd/resting.h"
 
 #include <errno.h>
 #include <math.h>
@@ -180,10 +181,19 @@ static void mark_saturated(struct rows *r, int y)
     }
 }
 
+// Of a frame that rests: the rows above y, which this sweep does not look at again.
+static void leave_rows(const struct raw_frame *f, int y)
+{
+    if (f && f->is_resting && y % 64 == 0)
+        resting_leave(f->site, 0, (size_t)y * (size_t)f->width * sizeof(*f->site));
+}
+
 // Quality of every site of row y into b->row_quality. To be called for y = 0, 1, 2, ...
 static void judge_row(struct rows *r, int y)
 {
     const struct bracket *b = r->b;
+    leave_rows(r->f, y);
+    leave_rows(r->shorter, y);
     const int n = 2 * b->bloom_px + 1, width = r->f->width, reach = b->bloom_px;
     const uint16_t *site = r->f->site + (size_t)y * (size_t)width;
     mark_saturated(r, y);

@@ -29,6 +29,7 @@ struct job {
     int width_px; // 0: by the lens
     bool json;
     // while it runs
+    char folder[PANORAMA_FILE_MAX]; // of the output: where frames and sums rest
     struct panorama_plan plan;
     struct json *report, *findings;
     struct sensor_noise noise;
@@ -179,6 +180,7 @@ static int merge_from(struct job *j, struct bracket **b, const struct panorama_s
             continue;
         }
         f.exposure_s = s->exposure_s;
+        raw_rest(&f, j->folder);
         if (!err && whose)
             err = bracket_add(*b, &waiting, &f, &whose->report);
         if (!err && !*b) {
@@ -349,10 +351,7 @@ static int do_stop(struct job *j, struct stitch *stitch, const struct panorama_s
     json_set_number(to, "roll_deg", stop->roll_deg);
     lens_head(R, stop->yaw_deg * M_PI / 180, stop->pitch_deg * M_PI / 180, stop->roll_deg * M_PI / 180);
     const int n = look_at_files(j, stop, shot);
-    const char *slash = strrchr(j->output, '/');
-    char folder[PANORAMA_FILE_MAX];
-    snprintf(folder, sizeof(folder), "%.*s", slash ? (int)(slash - j->output + 1) : 1, slash ? j->output : ".");
-    stitch_rest(stitch, folder);
+    stitch_rest(stitch, j->folder);
     int err = n ? measure_noise(j, stop, shot, n) : 0;
     if (!err && n)
         err = merge_stop(j, &b, stop, shot, n, &facts);
@@ -502,6 +501,8 @@ static int merge_plan(struct job *j)
     int err = whole ? panorama_plan_read(&j->plan, j->input) : -ENOMEM;
     if (err)
         goto out;
+    const char *slash = strrchr(j->output, '/');
+    snprintf(j->folder, sizeof(j->folder), "%.*s", slash ? (int)(slash - j->output + 1) : 1, slash ? j->output : ".");
     j->noise = j->plan.sensor;
     for (int i = 0; i < j->plan.n_stops; i++)
         n_frames += j->plan.stop[i].n_frames;

@@ -4,15 +4,13 @@
 // in it. Corners are shared by neighbouring pixels, so whatever the shape of an edge between them, what one loses the other gains. Only
 // at the poles, where a pixel spans much of the longitude, is it divided until its parts are small.
 #include "rigd/stitch.h"
+#include "rigd/resting.h"
 #include "solver/take/log.h"
 
 #include <errno.h>
-#include <fcntl.h>
 #include <math.h>
 #include <stdlib.h>
 #include <string.h>
-#include <sys/mman.h>
-#include <unistd.h>
 
 enum { CELLS_X = 256, CELLS_Y = 128, MOST_DIVISIONS = 6, POLYGON_MAX = 16 };
 
@@ -61,32 +59,19 @@ int stitch_new(struct stitch **out, int width)
     return 0;
 }
 
-// Of data, which is ours alone: the whole pages between the bytes begin and end. They take no memory from here on: a file keeps what was written,
-// other memory is zero again.
-static void leave_pages(void *data, size_t begin, size_t end)
-{
-    const uintptr_t page = (uintptr_t)sysconf(_SC_PAGESIZE), at = (uintptr_t)data;
-    const uintptr_t from = (at + begin + page - 1) / page * page, to = (at + end) / page * page;
-    if (from < to)
-        madvise((void *)from, to - from, MADV_DONTNEED);
-}
-
 void stitch_rest(struct stitch *s, const char *folder)
 {
     const size_t n_bytes = (size_t)s->width * (size_t)s->height * sizeof(*s->texel);
     if (!s->is_in_file && !s->n_stops) {
-        const int fd = open(folder, O_TMPFILE | O_RDWR | O_CLOEXEC, 0600);
-        void *at = fd < 0 || posix_fallocate(fd, 0, (off_t)n_bytes) ? MAP_FAILED : mmap(NULL, n_bytes, PROT_READ | PROT_WRITE, MAP_SHARED, fd, 0);
-        if (fd >= 0)
-            close(fd);
-        if (at != MAP_FAILED) {
+        struct texel *at = resting_new(folder, n_bytes);
+        if (at) {
             free(s->texel);
             s->texel = at;
             s->is_in_file = true;
         }
     }
     if (s->is_in_file)
-        leave_pages(s->texel, 0, n_bytes);
+        resting_leave(s->texel, 0, n_bytes);
 }
 
 void stitch_free(struct stitch *s)
@@ -94,7 +79,7 @@ void stitch_free(struct stitch *s)
     if (!s)
         return;
     if (s->is_in_file)
-        munmap(s->texel, (size_t)s->width * (size_t)s->height * sizeof(*s->texel));
+        resting_free(s->texel, (size_t)s->width * (size_t)s->height * sizeof(*s->texel));
     else
         free(s->texel);
     free(s->touched);
@@ -391,8 +376,6 @@ static int note_touched(struct stitch *s, struct view *v, const struct mosaic *m
 {
     const size_t n = (size_t)s->width * (size_t)s->height;
     const struct merged *m = mo->m;
-    free(s->is_touched);
-    s->is_touched = NULL;
     if (!memchr(m->quality, BRACKET_CLIPPED, (size_t)m->width * (size_t)m->height))
         return 0;
     s->is_touched = calloc(n, 1);
@@ -465,9 +448,9 @@ static int compare_with_before(struct stitch *s, struct stitch_stop_report *r)
 static void leave_rows(const struct merged *m, int y)
 {
     const size_t n = (size_t)(y > 2 ? y - 2 : 0) * (size_t)m->width;
-    leave_pages(m->radiance, 0, n * sizeof(*m->radiance));
-    leave_pages(m->variance, 0, n * sizeof(*m->variance));
-    leave_pages(m->quality, 0, n);
+    resting_leave(m->radiance, 0, n * sizeof(*m->radiance));
+    resting_leave(m->variance, 0, n * sizeof(*m->variance));
+    resting_leave(m->quality, 0, n);
 }
 
 static int add_stop(struct stitch *s, const struct lens *lens, const double R[9], const struct merged *m, bool is_last_use, struct stitch_stop_report *r)
@@ -508,6 +491,8 @@ static int add_stop(struct stitch *s, const struct lens *lens, const double R[9]
     if (!err)
         err = compare_with_before(s, r);
     s->n_stops += !err;
+    free(s->is_touched);
+    s->is_touched = NULL;
     free(v.upper);
     free(v.lower);
     return err;
@@ -562,7 +547,7 @@ int stitch_finish(struct image *out, struct stitch *s, const double M[9], struct
             to[7] = (float)fmin((double)t.clip / w, 1);
         }
         if (s->is_in_file && y % 64 == 63)
-            leave_pages(s->texel, 0, (size_t)(y + 1) * (size_t)s->width * sizeof(*s->texel));
+            resting_leave(s->texel, 0, (size_t)(y + 1) * (size_t)s->width * sizeof(*s->texel));
     }
     const int examined = panorama_examine(report, out);
     if (examined)
