@@ -472,15 +472,11 @@ static int row_of(void *arg, int y, float *row)
     return 0;
 }
 
-static int write_panorama(const struct job *j, struct image *p)
+static int write_panorama(const struct job *j, const struct image_rows *rows)
 {
-    const char *names[IMAGE_MAX_CHANNELS];
-    for (int c = 0; c < p->n_channels; c++)
-        names[c] = p->names[c];
-    const struct image_rows rows = { .width = p->width, .height = p->height, .n_channels = p->n_channels, .names = names, .row = row_of, .arg = p };
     const struct image_note notes[] = { { .name = "nodalOffsetM", .number = j->plan.nodal_offset_m },
                                         { .name = "radianceUnit", .text = "1 is white at 1/128 s, f/8, ISO 100, x gains x scale" } };
-    return image_write_exr_rows(&rows, notes, j->plan.n_stops ? 2 : 0, j->output, IMAGE_FLOAT, IMAGE_PIZ);
+    return image_write_exr_rows(rows, notes, j->plan.n_stops ? 2 : 0, j->output, IMAGE_FLOAT, IMAGE_PIZ);
 }
 
 static int default_width(const struct lens *l)
@@ -494,9 +490,8 @@ static int default_width(const struct lens *l)
 static int merge_plan(struct job *j)
 {
     struct stitch *stitch = NULL;
-    struct image panorama = { 0 };
+    struct stitch_rows rows = { 0 };
     struct panorama_report *whole = malloc(sizeof(*whole));
-    double M[9];
     int64_t n_frames = 0;
     int err = whole ? panorama_plan_read(&j->plan, j->input) : -ENOMEM;
     if (err)
@@ -524,13 +519,12 @@ static int merge_plan(struct job *j)
         err = -ENODATA;
     }
     if (!err)
-        err = colour_matrix(j, M);
+        err = colour_matrix(j, rows.rgb_from_camera);
+    rows.stitch = stitch;
     if (!err)
-        err = stitch_finish(&panorama, stitch, M, whole);
+        err = stitch_examine(whole, &rows);
     if (err)
         goto out;
-    stitch_free(stitch);
-    stitch = NULL;
     report_whole(j, whole, false);
     json_set_int(j->report, "width_px", width);
     json_set_number(j->report, "nodal_offset_m", j->plan.nodal_offset_m);
@@ -540,13 +534,12 @@ static int merge_plan(struct job *j)
     json_set_number(j->report, "electrons_at_white", j->noise.electrons_at_white);
     json_set_number(j->report, "read_noise_e", j->noise.read_noise_e);
     json_set_bool(j->report, "noise_measured", j->is_noise_measured);
-    err = write_panorama(j, &panorama);
+    err = write_panorama(j, &(struct image_rows){ .width = width, .height = width / 2, .n_channels = STITCH_CHANNELS, .names = stitch_channels, .row = stitch_row, .arg = &rows });
 out:
     if (err == -ENOMEM)
         log_error("panorama: %s: out of memory", j->input);
     free(whole);
     stitch_free(stitch);
-    image_free(&panorama);
     return err;
 }
 
@@ -593,7 +586,10 @@ static int pass_through(struct job *j)
             find(j, DOUBT, "not_radiance", NULL, NULL, "no value is above %g: a picture for the screen, or clipped at white? A panorama holds linear radiance", (double)highest);
         report_whole(j, whole, image_channel(&p, "clip") < 0);
         json_set_int(j->report, "width_px", p.width);
-        err = write_panorama(j, &p);
+        const char *names[IMAGE_MAX_CHANNELS];
+        for (int c = 0; c < p.n_channels; c++)
+            names[c] = p.names[c];
+        err = write_panorama(j, &(struct image_rows){ .width = p.width, .height = p.height, .n_channels = p.n_channels, .names = names, .row = row_of, .arg = &p });
     }
     image_free(&p);
     free(whole);

@@ -2,7 +2,7 @@
 #include "solver/take/json.h"
 #include "solver/take/log.h"
 #include "tests/panorama_camera.h"
-#include "tests/scratch.h"
+#include "tests/raw_files.h"
 
 #include <errno.h>
 #include <fcntl.h>
@@ -441,6 +441,66 @@ static int close_all(void **state)
     return scratch_close();
 }
 
+// An even grey, with the noise of photons so that frames do not look like a plateau. arg: its exposure.
+static uint16_t dim(void *arg, int x, int y)
+{
+    return (uint16_t)(512 + *(const double *)arg * (4000 + (x * 31 + y * 17) % 64));
+}
+
+static void a_merge_takes_less_memory_than_two_frames(void **state)
+{
+    (void)state;
+#if defined(__SANITIZE_ADDRESS__) || defined(__SANITIZE_THREAD__)
+    return; // which take their own
+#endif
+    enum { W = 4000, H = 3000, N = 3 };
+    const int fd = open(scratch_path(""), O_TMPFILE | O_RDWR, 0600); // without such files frames stay in memory
+    if (fd < 0) {
+        fprintf(stderr, "# memory of a merge not looked at: no file without a name in %s\n", scratch_path(""));
+        return;
+    }
+    close(fd);
+    char name[32], plan[700] = "";
+    size_t n = (size_t)snprintf(plan, sizeof(plan), "{\"lens\": {\"model\": \"equisolid\", \"width_px\": %d, \"height_px\": %d, \"focal_px\": 300, \"max_angle_deg\": 92},\n"
+                                                    " \"sensor\": {\"electrons_at_white\": 20000, \"read_noise_e\": 4}, \"stops\": [", W, H);
+    for (int s = 0; s < 2; s++) {
+        n += (size_t)snprintf(plan + n, sizeof(plan) - n, "%s{\"name\": \"s%d\", \"yaw_deg\": %d, \"frames\": [", s ? "," : "", s, 180 * s);
+        for (int k = 0; k < N; k++)
+            n += (size_t)snprintf(plan + n, sizeof(plan) - n, "%s{\"file\": \"large%d.dng\"}", k ? "," : "", k);
+        n += (size_t)snprintf(plan + n, sizeof(plan) - n, "]}");
+    }
+    n += (size_t)snprintf(plan + n, sizeof(plan) - n, "]}");
+    scratch_write("large.json", plan, n);
+    for (int k = 0; k < N; k++) {
+        struct raw_dng_info info = raw_info(W, H);
+        double exposure = exp2(-2 * k);
+        info.time_s *= exposure;
+        snprintf(name, sizeof(name), "large%d.dng", k);
+        raw_write(scratch_path(name), &info, dim, &exposure);
+    }
+    const int code = run("large.json", "--size 256");
+    double bytes = NAN;
+    int64_t n_used = 0;
+    assert_true(code == 0 || code == 3); // the frames of both stops are of one time
+    assert_int_equal(json_get_number(report, "peak_rss_bytes", &bytes), 0);
+    for (int s = 0; s < 2; s++)
+        for (int k = 0; k < N; k++) {
+            char key[40];
+            const char *verdict = "";
+            snprintf(key, sizeof(key), "stops.%d.frames.%d.verdict", s, k);
+            json_get_string(report, key, &verdict);
+            n_used += !strcmp(verdict, "fits");
+        }
+    assert_int_equal(n_used, 2 * N);
+    if (getenv("VERBOSE"))
+        fprintf(stderr, "%.1f MB\n", bytes * 1e-6);
+    assert_true(bytes < 2. * W * H * 6);
+    for (int k = 0; k < N; k++) {
+        snprintf(name, sizeof(name), "large%d.dng", k);
+        unlink(scratch_path(name));
+    }
+}
+
 int main(void)
 {
     const struct CMUnitTest tests[] = {
@@ -452,6 +512,7 @@ int main(void)
         cmocka_unit_test(a_changed_aperture_is_named_by_the_file_and_by_the_light),
         cmocka_unit_test(a_flickering_lamp_and_another_camera_are_named),
         cmocka_unit_test(a_stitched_panorama_is_checked_and_passed_on),
+        cmocka_unit_test(a_merge_takes_less_memory_than_two_frames),
     };
     return cmocka_run_group_tests(tests, open_all, close_all);
 }
