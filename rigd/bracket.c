@@ -38,7 +38,7 @@ struct bracket {
 static const char *const fault_text[] = {
     [BRACKET_FITS] = "fits", [BRACKET_OTHER_SIZE] = "other size", [BRACKET_OTHER_FILTERS] = "other colour filter array",
     [BRACKET_OTHER_CAMERA] = "other camera", [BRACKET_OTHER_LEVELS] = "other black or white level", [BRACKET_OTHER_ISO] = "other ISO",
-    [BRACKET_OTHER_APERTURE] = "other aperture", [BRACKET_NO_TIME] = "no exposure time",
+    [BRACKET_OTHER_APERTURE] = "other aperture", [BRACKET_NO_TIME] = "no exposure time, or one that cannot be",
     [BRACKET_OTHER_BRIGHTNESS] = "its brightness contradicts its exposure",
 };
 
@@ -49,8 +49,10 @@ const char *bracket_fault_text(enum bracket_fault f)
 
 double bracket_exposure(const struct raw_frame *f)
 {
+    static const double least = 1e-18, most = 1e18; // further than any shutter, filter, lens and sensor; squares of 1 / h still are floats
     const double n = f->f_number > 0 ? f->f_number : 1, iso = f->iso > 0 ? f->iso : 100;
-    return f->exposure_s > 0 ? f->exposure_s * iso / 100 / (n * n) : 0;
+    const double h = f->exposure_s > 0 ? f->exposure_s * iso / 100 / (n * n) : 0;
+    return h >= least && h <= most ? h : 0;
 }
 
 int bracket_new(struct bracket **out, const struct raw_frame *first, const struct bracket_options *o)

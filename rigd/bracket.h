@@ -25,7 +25,7 @@ struct sensor_noise {
 // only, so the scene need not be flat. Robust against things that moved. 0; -ENODATA: too little light or too few sites that both see.
 int sensor_noise_measure(struct sensor_noise *out, const struct raw_frame *a, const struct raw_frame *b);
 
-double bracket_exposure(const struct raw_frame *f); // h; ISO and N count as 100 and 1 where the file does not say; 0 without a time
+double bracket_exposure(const struct raw_frame *f); // h; ISO and N count as 100 and 1 where the file does not say; 0 without a time, or one that cannot be
 
 // ---- what comes next --------------------------------------------------------------------------------------------------------
 

@@ -186,6 +186,7 @@ static void read_matrix(const libraw_data_t *raw, double m[3][3])
 // camera_from_srgb = camera_from_xyz x xyz_from_srgb. Its rows' sums are the camera's answer to a white of D65: daylight takes it off.
 static void read_colour(struct raw_frame *f, const libraw_data_t *raw)
 {
+    static const double most_apart = 100;
     static const double xyz_from_srgb[3][3] = { { .4124564, .3575761, .1804375 }, { .2126729, .7151522, .0721750 }, { .0193339, .1191920, .9503041 } };
     double camera_from_xyz[3][3], camera_from_srgb[3][3] = { { 0 } }, answer[3] = { 0 };
     read_matrix(raw, camera_from_xyz);
@@ -199,6 +200,8 @@ static void read_colour(struct raw_frame *f, const libraw_data_t *raw)
     for (int i = 0; i < 3 && f->has_colour; i++)
         for (int j = 0; j < 3; j++)
             camera_from_srgb[i][j] /= answer[i];
+    for (int i = 0; i < 3; i++) // NaN and infinities, too: no camera has colours so far apart
+        f->has_colour = f->has_colour && answer[1] < most_apart * answer[i] && answer[i] < most_apart * answer[1];
     f->has_colour = f->has_colour && invert(camera_from_srgb, f->srgb_from_camera);
     for (int i = 0; i < 3; i++) {
         f->daylight[i] = f->has_colour ? answer[1] / answer[i] : 1;

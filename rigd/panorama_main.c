@@ -230,7 +230,8 @@ static void judge_frame(struct job *j, const struct panorama_stop *stop, const d
     if (shot[i].is_unreadable)
         return;
     if (r->fault == BRACKET_NO_TIME) {
-        find(j, DOUBT, kind_of(r->fault), stop->name, file, "left out: it does not say its exposure time; give \"exposure_s\" in the plan");
+        find(j, DOUBT, kind_of(r->fault), stop->name, file, "left out: it does not say its exposure time, or one that cannot be with its aperture and ISO (%g s); give \"exposure_s\" in the plan",
+             shot[i].exposure_s);
         return;
     }
     if (r->fault == BRACKET_OTHER_BRIGHTNESS) {
@@ -543,10 +544,26 @@ out:
     return err;
 }
 
+// A share is a number from 0 to 1, but for rounding.
+static int require_share(const struct image *p, const char *channel, const char *path)
+{
+    const int c = image_channel(p, channel);
+    const size_t n = (size_t)p->width * (size_t)p->height;
+    for (size_t i = 0; c >= 0 && i < n; i++) {
+        const float v = p->data[i * (size_t)p->n_channels + (size_t)c];
+        if (!(v >= -.01f && v <= 1.01f)) {
+            log_error("panorama: %s: channel %s, pixel %zu, %zu: found %g; expected a share, 0 .. 1: remove the channel if it means something else", path, channel,
+                      i % (size_t)p->width, i / (size_t)p->width, (double)v);
+            return -EINVAL;
+        }
+    }
+    return 0;
+}
+
 // A panorama that is stitched already: checked, and written as ours.
 static int pass_through(struct job *j)
 {
-    static const char *const rgb[] = { "R", "G", "B", NULL };
+    static const char *const looked_at[] = { "R", "G", "B", "variance.G", NULL };
     struct image p;
     struct panorama_report *whole = malloc(sizeof(*whole));
     int err = whole ? image_read(&p, j->input) : -ENOMEM;
@@ -561,7 +578,11 @@ static int pass_through(struct job *j)
         log_error("panorama: %s: found %dx%d pixels; expected twice as wide as high (latitude and longitude)", j->input, p.width, p.height);
         err = -EINVAL;
     } else {
-        err = image_require_finite(&p, rgb, j->input);
+        err = image_require_finite(&p, looked_at, j->input);
+        if (!err)
+            err = require_share(&p, "coverage", j->input);
+        if (!err)
+            err = require_share(&p, "clip", j->input);
     }
     int64_t n_negative = 0;
     float highest = 0;

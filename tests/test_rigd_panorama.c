@@ -405,6 +405,37 @@ static void a_stitched_panorama_is_checked_and_passed_on(void **state)
     assert_int_equal(image_write_exr(&p, scratch_path("in.exr"), IMAGE_FLOAT, IMAGE_ZIP), 0);
     assert_int_equal(run("in.exr", ""), 1);
     image_free(&p);
+    // Channels that are looked at, too, are numbers of their kind.
+    static const char *const names[] = { "R", "G", "B", "coverage", "clip", "variance.G", "Z" };
+    static const struct { int channel; float value; int code; } wrong[] = {
+        { 3, NAN, 1 }, { 3, INFINITY, 1 }, { 3, -5, 1 }, { 3, 1e30f, 1 }, { 4, NAN, 1 }, { 4, 7, 1 }, { 5, INFINITY, 1 }, { 6, INFINITY, 0 }, { 6, 1, 0 },
+    };
+    for (size_t k = 0; k < sizeof(wrong) / sizeof(wrong[0]); k++) {
+        assert_int_equal(image_new(&p, 64, 32, 7, names), 0);
+        for (int i = 0; i < 64 * 32; i++)
+            for (int c = 0; c < 7; c++)
+                p.data[7 * i + c] = c == 3 ? 1 : c == 4 ? 0 : 5 + (float)(i % 7);
+        p.data[7 * 1000 + wrong[k].channel] = wrong[k].value;
+        const float first = p.data[7 * 1000 + wrong[k].channel];
+        if (isnan(first)) // which our own writer refuses: put into the bytes of a picture that is not compressed
+            p.data[7 * 1000 + wrong[k].channel] = 12345.678f;
+        assert_int_equal(image_write_exr(&p, scratch_path("in.exr"), IMAGE_FLOAT, IMAGE_STORED), 0);
+        if (isnan(first)) {
+            const float mark = 12345.678f, nan = NAN;
+            char bytes[200000];
+            FILE *f = fopen(scratch_path("in.exr"), "r+b");
+            const size_t n = fread(bytes, 1, sizeof(bytes), f);
+            char *at = memmem(bytes, n, &mark, sizeof(mark));
+            assert_non_null(at);
+            memcpy(at, &nan, sizeof(nan));
+            rewind(f);
+            assert_int_equal(fwrite(bytes, 1, n, f), n);
+            fclose(f);
+        }
+        if (run("in.exr", "") != wrong[k].code || (access(scratch_path("panorama.exr"), F_OK) == 0) != !wrong[k].code)
+            fail_msg("%s %g", names[wrong[k].channel], (double)wrong[k].value);
+        image_free(&p);
+    }
     assert_int_equal(run("nowhere.exr", ""), 1);
     assert_int_equal(run("plan.json", "--size 7"), 2);
     assert_int_equal(run("plan.json", "--colour"), 2);
