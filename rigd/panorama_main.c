@@ -19,6 +19,7 @@
 #include <string.h>
 #include <sys/resource.h>
 #include <time.h>
+#include <unistd.h>
 
 enum { EXIT_DONE, EXIT_FAILED, EXIT_USAGE, EXIT_DOUBTFUL, OPTION_JSON };
 
@@ -29,6 +30,8 @@ struct job {
     int width_px; // 0: by the lens
     bool json;
     // while it runs
+    double start_s;
+    char *report_path;
     char folder[PANORAMA_FILE_MAX]; // of the output: where frames and sums rest
     struct panorama_plan plan;
     struct json *report, *findings;
@@ -473,11 +476,40 @@ static int row_of(void *arg, int y, float *row)
     return 0;
 }
 
-static int write_panorama(const struct job *j, const struct image_rows *rows)
+static double now_s(void)
+{
+    struct timespec t;
+    clock_gettime(CLOCK_MONOTONIC, &t);
+    return (double)t.tv_sec + 1e-9 * (double)t.tv_nsec;
+}
+
+// What is known at the end, or just before it.
+static void complete_report(struct job *j, bool is_done)
+{
+    struct rusage usage;
+    if (j->findings)
+        json_set(j->report, "findings", j->findings);
+    j->findings = NULL;
+    json_set_bool(j->report, "trusted", is_done && !j->is_doubtful);
+    getrusage(RUSAGE_SELF, &usage);
+    json_set_number(j->report, "wall_s", now_s() - j->start_s);
+    json_set_number(j->report, "cpu_s", (double)usage.ru_utime.tv_sec + 1e-6 * (double)usage.ru_utime.tv_usec);
+    json_set_int(j->report, "peak_rss_bytes", (int64_t)usage.ru_maxrss * 1024);
+}
+
+// Its report comes first: a panorama whose doubts were not written when this was killed would be taken for one that has none.
+static int write_panorama(struct job *j, const struct image_rows *rows)
 {
     const struct image_note notes[] = { { .name = "nodalOffsetM", .number = j->plan.nodal_offset_m },
                                         { .name = "radianceUnit", .text = "1 is white at 1/128 s, f/8, ISO 100, x gains x scale" } };
-    return image_write_exr_rows(rows, notes, j->plan.n_stops ? 2 : 0, j->output, IMAGE_FLOAT, IMAGE_PIZ);
+    complete_report(j, true);
+    int err = json_write(j->report, j->report_path);
+    if (err)
+        return err;
+    err = image_write_exr_rows(rows, notes, j->plan.n_stops ? 2 : 0, j->output, IMAGE_FLOAT, IMAGE_PIZ);
+    if (err)
+        unlink(j->report_path);
+    return err;
 }
 
 static int default_width(const struct lens *l)
@@ -670,13 +702,6 @@ static error_t parse(int key, char *arg, struct argp_state *state)
     }
 }
 
-static double now_s(void)
-{
-    struct timespec t;
-    clock_gettime(CLOCK_MONOTONIC, &t);
-    return (double)t.tv_sec + 1e-9 * (double)t.tv_nsec;
-}
-
 int main(int argc, char **argv)
 {
     static const struct argp argp = {
@@ -685,34 +710,32 @@ int main(int argc, char **argv)
         "panorama that is stitched already.\vThe report names clipped lights (solid angle, what they send at least), flicker, movement, frames and stops "
         "that are missing or do not belong, and directions that no stop saw. Exit status: 0 done, 1 failed, 2 usage, 3 done but the result is not to be "
         "trusted (the report says why).", NULL, NULL, NULL };
-    struct job j = { 0 };
-    struct rusage usage;
-    const double start = now_s();
+    struct job j = { .start_s = now_s() };
     argp_program_version = "rigd-panorama (studiorig) " STUDIORIG_VERSION;
     argp_err_exit_status = EXIT_USAGE;
     log_set_program("rigd-panorama");
     argp_parse(&argp, argc, argv, 0, NULL, &j);
+    j.report_path = report_path(j.output);
+    if (!j.report_path) {
+        log_error("panorama: out of memory");
+        return EXIT_FAILED;
+    }
     j.report = json_object();
     j.findings = json_array();
     json_set_string(j.report, "input", j.input);
     json_set_string(j.report, "output", j.output);
     const size_t n = strlen(j.input);
     int err = n > 5 && strcmp(j.input + n - 5, ".json") == 0 ? merge_plan(&j) : pass_through(&j);
-    json_set(j.report, "findings", j.findings);
-    json_set_bool(j.report, "trusted", !err && !j.is_doubtful);
-    getrusage(RUSAGE_SELF, &usage);
-    json_set_number(j.report, "wall_s", now_s() - start);
-    json_set_number(j.report, "cpu_s", (double)usage.ru_utime.tv_sec + 1e-6 * (double)usage.ru_utime.tv_usec);
-    json_set_int(j.report, "peak_rss_bytes", (int64_t)usage.ru_maxrss * 1024);
-    char *path = report_path(j.output), *text = j.json ? json_text(j.report) : NULL;
-    if (!path || (j.json && !text))
-        err = -ENOMEM;
+    complete_report(&j, !err);
     if (!err)
-        err = json_write(j.report, path);
+        err = json_write(j.report, j.report_path); // once more, with what the writing took
+    char *text = j.json ? json_text(j.report) : NULL;
+    if (j.json && !text)
+        err = -ENOMEM;
     if (text)
         puts(text);
     free(text);
-    free(path);
+    free(j.report_path);
     json_free(j.report);
     panorama_plan_free(&j.plan);
     return err ? EXIT_FAILED : j.is_doubtful ? EXIT_DOUBTFUL : EXIT_DONE;

@@ -6,6 +6,7 @@
 
 #include <errno.h>
 #include <fcntl.h>
+#include <sys/inotify.h>
 #include <sys/stat.h>
 #include <sys/wait.h>
 
@@ -472,6 +473,43 @@ static int close_all(void **state)
     return scratch_close();
 }
 
+// A kill at any time: whoever finds a panorama finds its doubts beside it.
+static void no_panorama_is_ever_there_without_its_report(void **state)
+{
+    (void)state;
+    char events[8192] __attribute__((aligned(8)));
+    static const char *const inputs[] = { "plan.json", "in.exr" };
+    write_plan(&none);
+    assert_int_equal(image_write_exr(&truth, scratch_path("in.exr"), IMAGE_FLOAT, IMAGE_ZIP), 0);
+    for (int k = 0; k < 2; k++) {
+        bool has_report = false, has_panorama = false;
+        unlink(scratch_path("panorama.exr"));
+        unlink(scratch_path("panorama-report.json"));
+        const int fd = inotify_init1(IN_NONBLOCK | IN_CLOEXEC);
+        assert_true(fd >= 0 && inotify_add_watch(fd, scratch_path(""), IN_MOVED_TO | IN_CREATE) >= 0);
+        assert_int_equal(run(inputs[k], ""), 0);
+        for (ssize_t n; (n = read(fd, events, sizeof(events))) > 0;)
+            for (const char *at = events; at < events + n;) {
+                const struct inotify_event *e = (const struct inotify_event *)at;
+                has_report = has_report || (e->len && !strcmp(e->name, "panorama-report.json"));
+                has_panorama = has_panorama || (e->len && !strcmp(e->name, "panorama.exr"));
+                assert_true(has_report || !has_panorama);
+                at += sizeof(*e) + e->len;
+            }
+        assert_true(has_panorama);
+        close(fd);
+    }
+    // One that cannot be written leaves no report, either.
+    unlink(scratch_path("panorama.exr"));
+    assert_int_equal(mkdir(scratch_path("panorama.exr"), 0777), 0);
+    unlink(scratch_path("panorama-report.json"));
+    char command[3000];
+    snprintf(command, sizeof(command), "%s/rigd-panorama '%s' -o '%s' >/dev/null 2>&1", getenv("BIN") ? getenv("BIN") : "build/bin", scratch_path("in.exr"), scratch_path("panorama.exr"));
+    assert_int_equal(WEXITSTATUS(system(command)), 1);
+    assert_true(access(scratch_path("panorama-report.json"), F_OK) != 0);
+    assert_int_equal(rmdir(scratch_path("panorama.exr")), 0);
+}
+
 // An even grey, with the noise of photons so that frames do not look like a plateau. arg: its exposure.
 static uint16_t dim(void *arg, int x, int y)
 {
@@ -543,6 +581,7 @@ int main(void)
         cmocka_unit_test(a_changed_aperture_is_named_by_the_file_and_by_the_light),
         cmocka_unit_test(a_flickering_lamp_and_another_camera_are_named),
         cmocka_unit_test(a_stitched_panorama_is_checked_and_passed_on),
+        cmocka_unit_test(no_panorama_is_ever_there_without_its_report),
         cmocka_unit_test(a_merge_takes_less_memory_than_two_frames),
     };
     return cmocka_run_group_tests(tests, open_all, close_all);
