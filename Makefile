@@ -120,7 +120,7 @@ $(BUILD)/tests/%: $(BUILD)/obj/tests/%.o $(BUILD)/librigsim.a $(BUILD)/librig.a 
 $(BUILD)/tests/test_camera_worker $(BUILD)/tests/test_config $(BUILD)/tests/test_rigsim_wire: | $(BUILD)/bin/rigd-camera $(BUILD)/bin/rigsim
 $(BUILD)/tests/test_developing: | $(BUILD)/bin/rigd-develop $(BUILD)/bin/rigctl
 $(BUILD)/tests/test_develop: | $(BUILD)/bin/rigd-unpack
-$(BUILD)/tests/test_develop: $(call object,rigd/develop.c)
+$(BUILD)/tests/test_develop: $(call object,rigd/develop.c rigd/resting.c)
 $(BUILD)/tests/test_develop: LIBS += $(LIBS_RAW)
 $(BUILD)/tests/test_rigd_panorama: | $(BUILD)/bin/rigd-develop $(BUILD)/bin/rigd-panorama
 $(BUILD)/tests/bench/stability_joint: $(call object,solver/commands/arguments.c)

@@ -1,9 +1,10 @@
 // rigd/bracket.c - the merge of a bracket, site by site, and what its frames say about each other.
 //
-// Two sums per site, and frames come one at a time, so that 24 megapixels times any number of frames take nine bytes per site. A frame is
+// Two sums per site, and frames come one at a time, so that 24 megapixels times any number of frames take eight bytes per site. A frame is
 // compared with what the frames before it predict, block by block, before it is taken in: the ratio of brightness is the test of its
 // exposure, what remains in a block is movement or flicker.
 #include "rigd/bracket.h"
+#include "rigd/resting.h"
 
 #include <errno.h>
 #include <math.h>
@@ -29,8 +30,7 @@ struct bracket {
     double saturation;   // lowest plateau so far, else the file's
     double longest;      // exposure
     double *taken;       // [n_taken] exposures
-    float *num, *den;    // sum u y, sum u h; den 0: num is the highest lower bound so far
-    uint8_t *quality;
+    float *num, *den;    // sum u y, sum u h; den < 0: the same of poor frames, as there was no good one; den 0: clipped in all, num is the highest lower bound
     uint8_t *row_quality, *saturated; // [width]; [2 bloom + 1][width]
     struct block *block;
 };
@@ -38,7 +38,7 @@ struct bracket {
 static const char *const fault_text[] = {
     [BRACKET_FITS] = "fits", [BRACKET_OTHER_SIZE] = "other size", [BRACKET_OTHER_FILTERS] = "other colour filter array",
     [BRACKET_OTHER_CAMERA] = "other camera", [BRACKET_OTHER_LEVELS] = "other black or white level", [BRACKET_OTHER_ISO] = "other ISO",
-    [BRACKET_OTHER_APERTURE] = "other aperture", [BRACKET_NO_TIME] = "no exposure time",
+    [BRACKET_OTHER_APERTURE] = "other aperture", [BRACKET_NO_TIME] = "no exposure time, or one that cannot be",
     [BRACKET_OTHER_BRIGHTNESS] = "its brightness contradicts its exposure",
 };
 
@@ -49,8 +49,10 @@ const char *bracket_fault_text(enum bracket_fault f)
 
 double bracket_exposure(const struct raw_frame *f)
 {
+    static const double least = 1e-18, most = 1e18; // further than any shutter, filter, lens and sensor; squares of 1 / h still are floats
     const double n = f->f_number > 0 ? f->f_number : 1, iso = f->iso > 0 ? f->iso : 100;
-    return f->exposure_s > 0 ? f->exposure_s * iso / 100 / (n * n) : 0;
+    const double h = f->exposure_s > 0 ? f->exposure_s * iso / 100 / (n * n) : 0;
+    return h >= least && h <= most ? h : 0;
 }
 
 int bracket_new(struct bracket **out, const struct raw_frame *first, const struct bracket_options *o)
@@ -73,11 +75,10 @@ int bracket_new(struct bracket **out, const struct raw_frame *first, const struc
     b->blocks_y = (first->height + BRACKET_BLOCK_PX - 1) / BRACKET_BLOCK_PX;
     b->num = calloc(n, sizeof(*b->num));
     b->den = calloc(n, sizeof(*b->den));
-    b->quality = calloc(n, 1);
     b->row_quality = malloc(width);
     b->saturated = malloc((size_t)(2 * b->bloom_px + 1) * width);
     b->block = malloc((size_t)b->blocks_x * (size_t)b->blocks_y * sizeof(*b->block));
-    if (!b->num || !b->den || !b->quality || !b->row_quality || !b->saturated || !b->block) {
+    if (!b->num || !b->den || !b->row_quality || !b->saturated || !b->block) {
         bracket_free(b);
         return -ENOMEM;
     }
@@ -92,7 +93,6 @@ void bracket_free(struct bracket *b)
     free(b->taken);
     free(b->num);
     free(b->den);
-    free(b->quality);
     free(b->row_quality);
     free(b->saturated);
     free(b->block);
@@ -180,10 +180,19 @@ static void mark_saturated(struct rows *r, int y)
     }
 }
 
+// Of a frame that rests: the rows above y, which this sweep does not look at again.
+static void leave_rows(const struct raw_frame *f, int y)
+{
+    if (f && f->is_resting && y % 64 == 0)
+        resting_leave(f->site, 0, (size_t)y * (size_t)f->width * sizeof(*f->site));
+}
+
 // Quality of every site of row y into b->row_quality. To be called for y = 0, 1, 2, ...
 static void judge_row(struct rows *r, int y)
 {
     const struct bracket *b = r->b;
+    leave_rows(r->f, y);
+    leave_rows(r->shorter, y);
     const int n = 2 * b->bloom_px + 1, width = r->f->width, reach = b->bloom_px;
     const uint16_t *site = r->f->site + (size_t)y * (size_t)width;
     mark_saturated(r, y);
@@ -247,7 +256,7 @@ static void compare_blocks(struct bracket *b, struct rows rows, double h)
         judge_row(&rows, y);
         for (int x = 0; x < f->width; x++) {
             const size_t i = row + (size_t)x;
-            if (b->row_quality[x] != BRACKET_GOOD || b->quality[i] != BRACKET_GOOD)
+            if (b->row_quality[x] != BRACKET_GOOD || !(b->den[i] > 0))
                 continue;
             const double black = b->like.black[y & 1][x & 1], s = (f->site[i] - black) / (b->like.white - black);
             const double radiance = (double)b->num[i] / (double)b->den[i], m = radiance * h;
@@ -382,21 +391,19 @@ static void take_in(struct bracket *b, struct rows rows, double h, struct bracke
             const double black = b->like.black[y & 1][x & 1], signal = (f->site[i] - black) / (b->like.white - black);
             if (quality == BRACKET_CLIPPED) {
                 r->n_clipped++;
-                if (b->quality[i] == BRACKET_CLIPPED)
+                if (b->den[i] == 0)
                     b->num[i] = fmaxf(b->num[i], (float)(signal / h));
                 continue;
             }
             *(quality == BRACKET_GOOD ? &r->n_good : &r->n_poor) += 1;
-            if (quality < b->quality[i])
+            if (quality == BRACKET_POOR && b->den[i] > 0)
                 continue;
-            if (quality > b->quality[i]) {
-                b->quality[i] = quality;
-                b->num[i] = b->den[i] = 0;
-            }
-            const double expected = fmax(b->den[i] > 0 ? (double)b->num[i] / (double)b->den[i] * h * w : signal * w, s);
+            const bool is_first = quality == BRACKET_GOOD ? !(b->den[i] > 0) : b->den[i] == 0;
+            const float num = is_first ? 0 : b->num[i], den = is_first ? 0 : fabsf(b->den[i]);
+            const double expected = fmax(is_first ? signal * w : (double)num / (double)den * h * w, s);
             const double u = s > 0 ? expected / (expected + s * s) : 1;
-            b->num[i] += (float)(u * signal);
-            b->den[i] += (float)(u * h);
+            b->num[i] = num + (float)(u * signal);
+            b->den[i] = copysignf(den + (float)(u * h), quality == BRACKET_GOOD ? 1 : -1);
         }
     }
 }
@@ -480,23 +487,28 @@ static void fill_in(struct merged *m, int x, int y)
 int bracket_finish(struct merged *out, struct bracket *b, int64_t *n_clipped, int64_t *n_defects)
 {
     const size_t width = (size_t)b->like.width, n = width * (size_t)b->like.height;
-    struct merged m = { .width = b->like.width, .height = b->like.height, .radiance = b->num, .variance = b->den, .quality = b->quality };
+    struct merged m = { .width = b->like.width, .height = b->like.height, .radiance = b->num, .variance = b->den };
     *out = (struct merged){ 0 };
     *n_clipped = *n_defects = 0;
-    if (!b->n_taken) {
+    if (b->n_taken)
+        m.quality = malloc(n);
+    if (!m.quality) {
+        const int err = b->n_taken ? -ENOMEM : -ENODATA;
         bracket_free(b);
-        return -ENODATA;
+        return err;
     }
     memcpy(m.cfa, b->like.cfa, sizeof(m.cfa));
     const double least = floor_radiance(b, b->longest), w = b->noise.electrons_at_white;
-    for (size_t i = 0; i < n; i++)
+    for (size_t i = 0; i < n; i++) {
+        m.quality[i] = b->den[i] > 0 ? BRACKET_GOOD : b->den[i] < 0 ? BRACKET_POOR : BRACKET_CLIPPED;
         if (m.quality[i] != BRACKET_CLIPPED) {
-            const double radiance = (double)b->num[i] / (double)b->den[i];
-            m.variance[i] = (float)(fmax(radiance, least) / (w * (double)b->den[i]));
+            const double den = fabs((double)b->den[i]), radiance = (double)b->num[i] / den;
+            m.variance[i] = (float)(fmax(radiance, least) / (w * den));
             m.radiance[i] = (float)radiance;
         } else {
             m.variance[i] = m.radiance[i] * m.radiance[i]; // unknown
         }
+    }
     for (int y = 0; y < m.height; y++)
         for (int x = 0; x < m.width; x++)
             if (m.quality[(size_t)y * width + (size_t)x] == BRACKET_CLIPPED) {
@@ -505,7 +517,6 @@ int bracket_finish(struct merged *out, struct bracket *b, int64_t *n_clipped, in
                 *(m.quality[(size_t)y * width + (size_t)x] == BRACKET_CLIPPED ? n_clipped : n_defects) += 1;
             }
     b->num = b->den = NULL;
-    b->quality = NULL;
     bracket_free(b);
     *out = m;
     return 0;

@@ -25,7 +25,7 @@ struct sensor_noise {
 // only, so the scene need not be flat. Robust against things that moved. 0; -ENODATA: too little light or too few sites that both see.
 int sensor_noise_measure(struct sensor_noise *out, const struct raw_frame *a, const struct raw_frame *b);
 
-double bracket_exposure(const struct raw_frame *f); // h; ISO and N count as 100 and 1 where the file does not say; 0 without a time
+double bracket_exposure(const struct raw_frame *f); // h; ISO and N count as 100 and 1 where the file does not say; 0 without a time, or one that cannot be
 
 // ---- what comes next --------------------------------------------------------------------------------------------------------
 
@@ -111,7 +111,7 @@ int bracket_new(struct bracket **out, const struct raw_frame *first, const struc
 // corrected by the caller. next: the next shorter frame, or NULL: only how far a site of f is beyond saturation is looked up in it. 0 or
 // -ENOMEM; the verdict is in *report.
 int bracket_add(struct bracket *b, const struct raw_frame *f, const struct raw_frame *next, struct bracket_frame_report *report);
-// Ends b, whatever comes of it. 0; -ENODATA: no frame was taken in.
+// Ends b, whatever comes of it. 0; -ENOMEM; -ENODATA: no frame was taken in.
 int bracket_finish(struct merged *out, struct bracket *b, int64_t *n_clipped, int64_t *n_defects);
 void bracket_free(struct bracket *b); // NULL allowed
 void merged_unshade(struct merged *m, const struct lens *lens); // what the lens' corners lost: of the same size

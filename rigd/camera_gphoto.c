@@ -41,7 +41,7 @@
 enum {
     CHUNK = 1 << 20,          // of a download; what the driver itself asks for
     CHOICES_MAX = 1024,       // of a setting
-    FOLDERS_MAX = 512,        // of a card
+    FOLDERS_MAX = 4096,       // of a card and kind: counted ones end at 999
     PREVIEW_MAX = 16 << 20,   // bytes
     STORES_MAX = 8,           // that a body may report
 };
@@ -1096,58 +1096,89 @@ static int list_files(struct gphoto *g, struct listing *l, const char *folder)
     return n_files;
 }
 
+struct folders {
+    char (*path)[96];
+    int n, room;
+};
+
+// What would not be looked at is refused: a frame could lie in it. Hidden folders hold none.
+static int add_folder(struct listing *l, struct folders *f, const char *parent, const char *name)
+{
+    if (name[0] == '.')
+        return 0;
+    if (f->n == FOLDERS_MAX)
+        return gphoto_fail(l->e, CAMERA_CARD, -E2BIG, "its card has more than %d folders, and no listing of it is complete: save what is on it, then format it in the body",
+                           FOLDERS_MAX);
+    if (strlen(parent) + 1 + strlen(name) >= sizeof(f->path[0]))
+        return gphoto_fail(l->e, CAMERA_CARD, -ENAMETOOLONG, "its card has a folder in %.60s whose name is too long to look into: remove it, or format the card in the body",
+                           parent);
+    if (f->n == f->room) {
+        const int room = f->room ? 2 * f->room : 32;
+        char (*path)[96] = realloc(f->path, (size_t)room * sizeof(*path));
+        if (!path)
+            return gphoto_fail(l->e, CAMERA_BROKEN, -ENOMEM, "no memory for a listing");
+        f->path = path;
+        f->room = room;
+    }
+    char *end = stpcpy(f->path[f->n++], parent);
+    if (name[0])
+        strcpy(stpcpy(end, "/"), name);
+    return 0;
+}
+
+static int by_dcf_number(const void *a, const void *b)
+{
+    return dcf_number(b) - dcf_number(a); // newest first
+}
+
 // Breadth first through folders that are not counted by DCF; those that are, newest first and only as far back as needed.
 static int list_store(struct gphoto *g, struct listing *l, const char *store)
 {
-    char (*folder)[96] = calloc(FOLDERS_MAX, sizeof(*folder)), (*dcf)[96] = calloc(FOLDERS_MAX, sizeof(*dcf));
-    int n_folders = 1, n_dcf = 0, result = 0;
+    struct folders other = { 0 }, dcf = { 0 };
     struct camera_object any;
-    if (!folder || !dcf) {
-        result = gphoto_fail(l->e, CAMERA_BROKEN, -ENOMEM, "no memory for a listing");
-        goto done;
-    }
+    int result = 0;
     if (!take_object(&any, store, "x", 0))
         goto done;
-    strcpy(folder[0], store);
-    for (int i = 0; i < n_folders && result >= 0; i++) {
+    result = add_folder(l, &other, store, "");
+    for (int i = 0; i < other.n && result >= 0; i++) {
         CameraList *list;
-        result = list_files(g, l, folder[i]);
-        if (result < 0 || gp_list_new(&list) < 0)
+        char folder[sizeof(other.path[0])];
+        strcpy(folder, other.path[i]); // the list of them moves when it grows
+        result = list_files(g, l, folder);
+        if (result < 0)
             break;
+        if (gp_list_new(&list) < 0) {
+            result = gphoto_fail(l->e, CAMERA_BROKEN, -ENOMEM, "no memory for a listing");
+            break;
+        }
         const int64_t began = begin(g);
-        const int code = gp_camera_folder_list_folders(g->camera, folder[i], list, g->context);
+        const int code = gp_camera_folder_list_folders(g->camera, folder, list, g->context);
         if (code < 0)
             result = failed(g, l->e, code, began, "cannot list its card");
         const int n = code < 0 ? 0 : gp_list_count(list);
-        for (int k = 0; k < n; k++) {
+        for (int k = 0; k < n && result >= 0; k++) {
             const char *name = NULL;
-            if (gp_list_get_name(list, k, &name) < 0 || !name || strlen(folder[i]) + 1 + strlen(name) >= sizeof(folder[0]))
-                continue;
-            char (*to)[96] = dcf_number(name) >= 0 ? dcf : folder;
-            int *count = to == dcf ? &n_dcf : &n_folders;
-            if (*count < FOLDERS_MAX) {
-                char *end = stpcpy(stpcpy(to[*count], folder[i]), "/");
-                strcpy(end, name); // they fit: see above
-                ++*count;
-            }
+            if (gp_list_get_name(list, k, &name) >= 0 && name && name[0])
+                result = add_folder(l, dcf_number(name) >= 0 ? &dcf : &other, folder, name);
         }
         gp_list_free(list);
     }
     const struct camera_object *after = l->c->n_objects ? after_of(l->c, &any) : NULL;
     const int oldest = after ? dcf_number(after->folder) : -1;
-    for (int number = 999; number >= 0 && result >= 0; number--) {
-        int n_files = 0;
-        for (int k = 0; k < n_dcf && result >= 0; k++)
-            if (dcf_number(dcf[k]) == number) {
-                result = list_files(g, l, dcf[k]);
-                n_files += result > 0 ? result : 0;
-            }
-        if (number <= oldest || (!l->c->n_objects && n_files))
+    if (dcf.n)
+        qsort(dcf.path, (size_t)dcf.n, sizeof(dcf.path[0]), by_dcf_number);
+    for (int i = 0, n_files = 0; i < dcf.n && result >= 0; i++) {
+        const int number = dcf_number(dcf.path[i]);
+        if (number < oldest)
+            break;
+        result = list_files(g, l, dcf.path[i]);
+        n_files += result > 0 ? result : 0;
+        if (!l->c->n_objects && n_files && (i + 1 == dcf.n || dcf_number(dcf.path[i + 1]) != number))
             break;
     }
 done:
-    free(folder);
-    free(dcf);
+    free(other.path);
+    free(dcf.path);
     return result < 0 ? result : 0;
 }
 

@@ -1,6 +1,7 @@
 // rigd/develop.c - LibRaw, and nothing else knows it.
 #include "rigd/develop.h"
 #include "rigd/exif.h"
+#include "rigd/resting.h"
 
 #include <errno.h>
 #include <fcntl.h>
@@ -20,6 +21,8 @@ typedef int file_offset;
 #endif
 
 // ---- opening -----------------------------------------------------------------------------------------------------------------
+
+enum { LEAVE_ROWS = 64 }; // memory goes back in bands of so many rows
 
 struct decoder {
     libraw_data_t *raw;
@@ -183,6 +186,7 @@ static void read_matrix(const libraw_data_t *raw, double m[3][3])
 // camera_from_srgb = camera_from_xyz x xyz_from_srgb. Its rows' sums are the camera's answer to a white of D65: daylight takes it off.
 static void read_colour(struct raw_frame *f, const libraw_data_t *raw)
 {
+    static const double most_apart = 100;
     static const double xyz_from_srgb[3][3] = { { .4124564, .3575761, .1804375 }, { .2126729, .7151522, .0721750 }, { .0193339, .1191920, .9503041 } };
     double camera_from_xyz[3][3], camera_from_srgb[3][3] = { { 0 } }, answer[3] = { 0 };
     read_matrix(raw, camera_from_xyz);
@@ -196,6 +200,8 @@ static void read_colour(struct raw_frame *f, const libraw_data_t *raw)
     for (int i = 0; i < 3 && f->has_colour; i++)
         for (int j = 0; j < 3; j++)
             camera_from_srgb[i][j] /= answer[i];
+    for (int i = 0; i < 3; i++) // NaN and infinities, too: no camera has colours so far apart
+        f->has_colour = f->has_colour && answer[1] < most_apart * answer[i] && answer[i] < most_apart * answer[1];
     f->has_colour = f->has_colour && invert(camera_from_srgb, f->srgb_from_camera);
     for (int i = 0; i < 3; i++) {
         f->daylight[i] = f->has_colour ? answer[1] / answer[i] : 1;
@@ -248,6 +254,7 @@ static void read_exposure(struct raw_frame *f, const libraw_data_t *raw, const c
     copy_text(f->lens, sizeof(f->lens), exif.lens[0] ? exif.lens : raw->lens.Lens);
 }
 
+// LibRaw's photosites are gone afterwards.
 static int copy_sites(struct raw_frame *f, const libraw_data_t *raw, char *why, size_t room)
 {
     const libraw_image_sizes_t *s = &raw->sizes;
@@ -262,9 +269,12 @@ static int copy_sites(struct raw_frame *f, const libraw_data_t *raw, char *why, 
         return -ENOMEM;
     }
     f->width = s->width, f->height = s->height;
-    for (int y = 0; y < f->height; y++)
-        memcpy(f->site + (size_t)y * (size_t)f->width, raw->rawdata.raw_image + (size_t)(y + s->top_margin) * pitch + s->left_margin,
-               (size_t)f->width * sizeof(f->site[0]));
+    for (int y = 0; y < f->height; y++) {
+        const size_t row = (size_t)(y + s->top_margin) * pitch;
+        if (y % LEAVE_ROWS == 0) // so that both together take the memory of one
+            resting_leave(raw->rawdata.raw_image, 0, row * sizeof(f->site[0]));
+        memcpy(f->site + (size_t)y * (size_t)f->width, raw->rawdata.raw_image + row + s->left_margin, (size_t)f->width * sizeof(f->site[0]));
+    }
     return 0;
 }
 
@@ -294,8 +304,28 @@ int raw_read(struct raw_frame *out, const char *path, char *why, size_t room)
 void raw_free(struct raw_frame *f)
 {
     if (f) {
-        free(f->site);
+        if (f->is_resting)
+            resting_free(f->site, (size_t)f->width * (size_t)f->height * sizeof(f->site[0]));
+        else
+            free(f->site);
         *f = (struct raw_frame){ 0 };
+    }
+}
+
+void raw_rest(struct raw_frame *f, const char *folder)
+{
+    const size_t row = (size_t)f->width * sizeof(f->site[0]), n_bytes = row * (size_t)f->height;
+    uint16_t *to = f->site && !f->is_resting ? resting_new(folder, n_bytes) : NULL;
+    for (size_t at = 0; to && at < n_bytes; at += LEAVE_ROWS * row) {
+        const size_t end = n_bytes - at < LEAVE_ROWS * row ? n_bytes : at + LEAVE_ROWS * row;
+        memcpy((char *)to + at, (char *)f->site + at, end - at);
+        resting_leave(f->site, 0, end);
+        resting_leave(to, 0, end);
+    }
+    if (to) {
+        free(f->site);
+        f->site = to;
+        f->is_resting = true;
     }
 }
 

@@ -27,6 +27,7 @@ enum { RAW_RED, RAW_GREEN, RAW_BLUE };
 struct raw_frame {
     int width, height; // the lit area, as it lies on the sensor (not turned by orientation)
     uint16_t *site;    // [height][width] DN
+    bool is_resting;   // site lies in a file: see raw_rest()
     uint8_t cfa[2][2]; // RAW_*
     double black[2][2];
     double white;      // DN that developing maps to 1
@@ -50,6 +51,9 @@ struct raw_frame {
 
 int raw_read(struct raw_frame *out, const char *path, char *why, size_t room);
 void raw_free(struct raw_frame *f); // NULL and zeroed allowed; leaves it zeroed
+// A frame that waits while others are read: its sites move to a file without a name in folder (rigd/resting.h), from where they come back
+// when they are looked at. Where that cannot be, they stay.
+void raw_rest(struct raw_frame *f, const char *folder);
 
 // Without site: the head of the file alone, for what is decided before anything large is read. Levels may be those before decoding.
 int raw_read_head(struct raw_frame *out, const char *path, char *why, size_t room);

@@ -19,6 +19,7 @@
 #include <string.h>
 #include <sys/resource.h>
 #include <time.h>
+#include <unistd.h>
 
 enum { EXIT_DONE, EXIT_FAILED, EXIT_USAGE, EXIT_DOUBTFUL, OPTION_JSON };
 
@@ -29,6 +30,9 @@ struct job {
     int width_px; // 0: by the lens
     bool json;
     // while it runs
+    double start_s;
+    char *report_path;
+    char folder[PANORAMA_FILE_MAX]; // of the output: where frames and sums rest
     struct panorama_plan plan;
     struct json *report, *findings;
     struct sensor_noise noise;
@@ -179,6 +183,7 @@ static int merge_from(struct job *j, struct bracket **b, const struct panorama_s
             continue;
         }
         f.exposure_s = s->exposure_s;
+        raw_rest(&f, j->folder);
         if (!err && whose)
             err = bracket_add(*b, &waiting, &f, &whose->report);
         if (!err && !*b) {
@@ -228,7 +233,8 @@ static void judge_frame(struct job *j, const struct panorama_stop *stop, const d
     if (shot[i].is_unreadable)
         return;
     if (r->fault == BRACKET_NO_TIME) {
-        find(j, DOUBT, kind_of(r->fault), stop->name, file, "left out: it does not say its exposure time; give \"exposure_s\" in the plan");
+        find(j, DOUBT, kind_of(r->fault), stop->name, file, "left out: it does not say its exposure time, or one that cannot be with its aperture and ISO (%g s); give \"exposure_s\" in the plan",
+             shot[i].exposure_s);
         return;
     }
     if (r->fault == BRACKET_OTHER_BRIGHTNESS) {
@@ -349,10 +355,7 @@ static int do_stop(struct job *j, struct stitch *stitch, const struct panorama_s
     json_set_number(to, "roll_deg", stop->roll_deg);
     lens_head(R, stop->yaw_deg * M_PI / 180, stop->pitch_deg * M_PI / 180, stop->roll_deg * M_PI / 180);
     const int n = look_at_files(j, stop, shot);
-    const char *slash = strrchr(j->output, '/');
-    char folder[PANORAMA_FILE_MAX];
-    snprintf(folder, sizeof(folder), "%.*s", slash ? (int)(slash - j->output + 1) : 1, slash ? j->output : ".");
-    stitch_rest(stitch, folder);
+    stitch_rest(stitch, j->folder);
     int err = n ? measure_noise(j, stop, shot, n) : 0;
     if (!err && n)
         err = merge_stop(j, &b, stop, shot, n, &facts);
@@ -473,15 +476,40 @@ static int row_of(void *arg, int y, float *row)
     return 0;
 }
 
-static int write_panorama(const struct job *j, struct image *p)
+static double now_s(void)
 {
-    const char *names[IMAGE_MAX_CHANNELS];
-    for (int c = 0; c < p->n_channels; c++)
-        names[c] = p->names[c];
-    const struct image_rows rows = { .width = p->width, .height = p->height, .n_channels = p->n_channels, .names = names, .row = row_of, .arg = p };
+    struct timespec t;
+    clock_gettime(CLOCK_MONOTONIC, &t);
+    return (double)t.tv_sec + 1e-9 * (double)t.tv_nsec;
+}
+
+// What is known at the end, or just before it.
+static void complete_report(struct job *j, bool is_done)
+{
+    struct rusage usage;
+    if (j->findings)
+        json_set(j->report, "findings", j->findings);
+    j->findings = NULL;
+    json_set_bool(j->report, "trusted", is_done && !j->is_doubtful);
+    getrusage(RUSAGE_SELF, &usage);
+    json_set_number(j->report, "wall_s", now_s() - j->start_s);
+    json_set_number(j->report, "cpu_s", (double)usage.ru_utime.tv_sec + 1e-6 * (double)usage.ru_utime.tv_usec);
+    json_set_int(j->report, "peak_rss_bytes", (int64_t)usage.ru_maxrss * 1024);
+}
+
+// Its report comes first: a panorama whose doubts were not written when this was killed would be taken for one that has none.
+static int write_panorama(struct job *j, const struct image_rows *rows)
+{
     const struct image_note notes[] = { { .name = "nodalOffsetM", .number = j->plan.nodal_offset_m },
                                         { .name = "radianceUnit", .text = "1 is white at 1/128 s, f/8, ISO 100, x gains x scale" } };
-    return image_write_exr_rows(&rows, notes, j->plan.n_stops ? 2 : 0, j->output, IMAGE_FLOAT, IMAGE_PIZ);
+    complete_report(j, true);
+    int err = json_write(j->report, j->report_path);
+    if (err)
+        return err;
+    err = image_write_exr_rows(rows, notes, j->plan.n_stops ? 2 : 0, j->output, IMAGE_FLOAT, IMAGE_PIZ);
+    if (err)
+        unlink(j->report_path);
+    return err;
 }
 
 static int default_width(const struct lens *l)
@@ -495,13 +523,14 @@ static int default_width(const struct lens *l)
 static int merge_plan(struct job *j)
 {
     struct stitch *stitch = NULL;
-    struct image panorama = { 0 };
+    struct stitch_rows rows = { 0 };
     struct panorama_report *whole = malloc(sizeof(*whole));
-    double M[9];
     int64_t n_frames = 0;
     int err = whole ? panorama_plan_read(&j->plan, j->input) : -ENOMEM;
     if (err)
         goto out;
+    const char *slash = strrchr(j->output, '/');
+    snprintf(j->folder, sizeof(j->folder), "%.*s", slash ? (int)(slash - j->output + 1) : 1, slash ? j->output : ".");
     j->noise = j->plan.sensor;
     for (int i = 0; i < j->plan.n_stops; i++)
         n_frames += j->plan.stop[i].n_frames;
@@ -523,13 +552,12 @@ static int merge_plan(struct job *j)
         err = -ENODATA;
     }
     if (!err)
-        err = colour_matrix(j, M);
+        err = colour_matrix(j, rows.rgb_from_camera);
+    rows.stitch = stitch;
     if (!err)
-        err = stitch_finish(&panorama, stitch, M, whole);
+        err = stitch_examine(whole, &rows);
     if (err)
         goto out;
-    stitch_free(stitch);
-    stitch = NULL;
     report_whole(j, whole, false);
     json_set_int(j->report, "width_px", width);
     json_set_number(j->report, "nodal_offset_m", j->plan.nodal_offset_m);
@@ -539,20 +567,35 @@ static int merge_plan(struct job *j)
     json_set_number(j->report, "electrons_at_white", j->noise.electrons_at_white);
     json_set_number(j->report, "read_noise_e", j->noise.read_noise_e);
     json_set_bool(j->report, "noise_measured", j->is_noise_measured);
-    err = write_panorama(j, &panorama);
+    err = write_panorama(j, &(struct image_rows){ .width = width, .height = width / 2, .n_channels = STITCH_CHANNELS, .names = stitch_channels, .row = stitch_row, .arg = &rows });
 out:
     if (err == -ENOMEM)
         log_error("panorama: %s: out of memory", j->input);
     free(whole);
     stitch_free(stitch);
-    image_free(&panorama);
     return err;
+}
+
+// A share is a number from 0 to 1, but for rounding.
+static int require_share(const struct image *p, const char *channel, const char *path)
+{
+    const int c = image_channel(p, channel);
+    const size_t n = (size_t)p->width * (size_t)p->height;
+    for (size_t i = 0; c >= 0 && i < n; i++) {
+        const float v = p->data[i * (size_t)p->n_channels + (size_t)c];
+        if (!(v >= -.01f && v <= 1.01f)) {
+            log_error("panorama: %s: channel %s, pixel %zu, %zu: found %g; expected a share, 0 .. 1: remove the channel if it means something else", path, channel,
+                      i % (size_t)p->width, i / (size_t)p->width, (double)v);
+            return -EINVAL;
+        }
+    }
+    return 0;
 }
 
 // A panorama that is stitched already: checked, and written as ours.
 static int pass_through(struct job *j)
 {
-    static const char *const rgb[] = { "R", "G", "B", NULL };
+    static const char *const looked_at[] = { "R", "G", "B", "variance.G", NULL };
     struct image p;
     struct panorama_report *whole = malloc(sizeof(*whole));
     int err = whole ? image_read(&p, j->input) : -ENOMEM;
@@ -567,7 +610,11 @@ static int pass_through(struct job *j)
         log_error("panorama: %s: found %dx%d pixels; expected twice as wide as high (latitude and longitude)", j->input, p.width, p.height);
         err = -EINVAL;
     } else {
-        err = image_require_finite(&p, rgb, j->input);
+        err = image_require_finite(&p, looked_at, j->input);
+        if (!err)
+            err = require_share(&p, "coverage", j->input);
+        if (!err)
+            err = require_share(&p, "clip", j->input);
     }
     int64_t n_negative = 0;
     float highest = 0;
@@ -592,7 +639,10 @@ static int pass_through(struct job *j)
             find(j, DOUBT, "not_radiance", NULL, NULL, "no value is above %g: a picture for the screen, or clipped at white? A panorama holds linear radiance", (double)highest);
         report_whole(j, whole, image_channel(&p, "clip") < 0);
         json_set_int(j->report, "width_px", p.width);
-        err = write_panorama(j, &p);
+        const char *names[IMAGE_MAX_CHANNELS];
+        for (int c = 0; c < p.n_channels; c++)
+            names[c] = p.names[c];
+        err = write_panorama(j, &(struct image_rows){ .width = p.width, .height = p.height, .n_channels = p.n_channels, .names = names, .row = row_of, .arg = &p });
     }
     image_free(&p);
     free(whole);
@@ -652,13 +702,6 @@ static error_t parse(int key, char *arg, struct argp_state *state)
     }
 }
 
-static double now_s(void)
-{
-    struct timespec t;
-    clock_gettime(CLOCK_MONOTONIC, &t);
-    return (double)t.tv_sec + 1e-9 * (double)t.tv_nsec;
-}
-
 int main(int argc, char **argv)
 {
     static const struct argp argp = {
@@ -667,34 +710,32 @@ int main(int argc, char **argv)
         "panorama that is stitched already.\vThe report names clipped lights (solid angle, what they send at least), flicker, movement, frames and stops "
         "that are missing or do not belong, and directions that no stop saw. Exit status: 0 done, 1 failed, 2 usage, 3 done but the result is not to be "
         "trusted (the report says why).", NULL, NULL, NULL };
-    struct job j = { 0 };
-    struct rusage usage;
-    const double start = now_s();
+    struct job j = { .start_s = now_s() };
     argp_program_version = "rigd-panorama (studiorig) " STUDIORIG_VERSION;
     argp_err_exit_status = EXIT_USAGE;
     log_set_program("rigd-panorama");
     argp_parse(&argp, argc, argv, 0, NULL, &j);
+    j.report_path = report_path(j.output);
+    if (!j.report_path) {
+        log_error("panorama: out of memory");
+        return EXIT_FAILED;
+    }
     j.report = json_object();
     j.findings = json_array();
     json_set_string(j.report, "input", j.input);
     json_set_string(j.report, "output", j.output);
     const size_t n = strlen(j.input);
     int err = n > 5 && strcmp(j.input + n - 5, ".json") == 0 ? merge_plan(&j) : pass_through(&j);
-    json_set(j.report, "findings", j.findings);
-    json_set_bool(j.report, "trusted", !err && !j.is_doubtful);
-    getrusage(RUSAGE_SELF, &usage);
-    json_set_number(j.report, "wall_s", now_s() - start);
-    json_set_number(j.report, "cpu_s", (double)usage.ru_utime.tv_sec + 1e-6 * (double)usage.ru_utime.tv_usec);
-    json_set_int(j.report, "peak_rss_bytes", (int64_t)usage.ru_maxrss * 1024);
-    char *path = report_path(j.output), *text = j.json ? json_text(j.report) : NULL;
-    if (!path || (j.json && !text))
-        err = -ENOMEM;
+    complete_report(&j, !err);
     if (!err)
-        err = json_write(j.report, path);
+        err = json_write(j.report, j.report_path); // once more, with what the writing took
+    char *text = j.json ? json_text(j.report) : NULL;
+    if (j.json && !text)
+        err = -ENOMEM;
     if (text)
         puts(text);
     free(text);
-    free(path);
+    free(j.report_path);
     json_free(j.report);
     panorama_plan_free(&j.plan);
     return err ? EXIT_FAILED : j.is_doubtful ? EXIT_DOUBTFUL : EXIT_DONE;

@@ -43,15 +43,18 @@ struct crew {
 static int find_program(struct crew *c)
 {
     const ssize_t n = readlink("/proc/self/exe", c->program, sizeof(c->program) - 16);
-    char *slash;
-    if (n < 0)
-        return -errno;
+    if (n < 0 || n == sizeof(c->program) - 16) {
+        const int err = n < 0 ? -errno : -ENAMETOOLONG;
+        log_error("develop: cannot tell where rigctl is (/proc/self/exe): %s; rigd-develop belongs beside it", strerror(-err));
+        return err;
+    }
     c->program[n] = 0;
-    slash = strrchr(c->program, '/');
+    char *slash = strrchr(c->program, '/');
     strcpy(slash ? slash + 1 : c->program, "rigd-develop");
     if (access(c->program, X_OK)) {
-        log_error("develop: cannot run %s: %s; it belongs beside rigctl", c->program, strerror(errno));
-        return -errno;
+        const int err = -errno;
+        log_error("develop: cannot run %s: %s; it belongs beside rigctl", c->program, strerror(-err));
+        return err;
     }
     return 0;
 }
@@ -71,8 +74,9 @@ static int start(struct crew *c, struct worker *w, int frame)
     if (!argv)
         return -ENOMEM;
     if (pipe2(fd, O_CLOEXEC)) {
+        const int err = -errno;
         free(argv);
-        return -errno;
+        return err;
     }
     argv[0] = c->program;
     const pid_t pid = fork();
@@ -650,9 +654,13 @@ static char *place_text(const struct json *v)
     return out;
 }
 
+// A place for a frame that is not here may be of a rig of which only some bodies are measured; but where others take the place that is for
+// all, it is more likely a name with an error in it, whose frame would be measured elsewhere.
 static int find_places(struct colour_arguments *a)
 {
     struct json *doc = NULL;
+    char strangers[200] = "";
+    int n_strangers = 0, n_given = 0;
     int err = a->places_path ? json_read(&doc, a->places_path) : 0;
     const int n = doc ? json_length(doc, "places") : 0;
     if (!err && n < 0) {
@@ -668,12 +676,28 @@ static int find_places(struct colour_arguments *a)
             log_error("calibrate: %s: %s: expected file, and patch (4 numbers) or chart (8)", a->places_path, path);
             err = -EINVAL;
         }
+        int n_meant = 0;
         for (int i = 0; i < a->n && !err; i++)
             if (!strcmp(text_of(v, "file"), a->raw[i]) || !strcmp(text_of(v, "file"), base_name(a->raw[i]))) {
                 free(a->place[i]);
                 a->place[i] = strdup(text);
+                n_meant++;
             }
+        if (!err && !n_meant) {
+            const size_t used = strlen(strangers);
+            if (n_strangers++ < 4)
+                snprintf(strangers + used, sizeof(strangers) - used, "%s%s", used ? ", " : "", text_of(v, "file"));
+        }
         free(text);
+    }
+    for (int i = 0; i < a->n && !err; i++)
+        n_given += a->place[i] != NULL;
+    if (!err && n_strangers && n_given < a->n && a->everywhere) {
+        log_error("calibrate: %s: %d of %d places are for no frame that was given (%s%s), while %d frames would take %s: mend the names, or take them out", a->places_path, n_strangers, n, strangers,
+                  n_strangers > 4 ? ", ..." : "", a->n - n_given, a->everywhere);
+        err = -EINVAL;
+    } else if (!err && n_strangers) {
+        log_warning("calibrate: %s: %d of %d places are for no frame that was given: %s%s", a->places_path, n_strangers, n, strangers, n_strangers > 4 ? ", ..." : "");
     }
     for (int i = 0; i < a->n && !err; i++) {
         if (!a->place[i] && a->everywhere)

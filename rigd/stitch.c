@@ -4,15 +4,13 @@
 // in it. Corners are shared by neighbouring pixels, so whatever the shape of an edge between them, what one loses the other gains. Only
 // at the poles, where a pixel spans much of the longitude, is it divided until its parts are small.
 #include "rigd/stitch.h"
+#include "rigd/resting.h"
 #include "solver/take/log.h"
 
 #include <errno.h>
-#include <fcntl.h>
 #include <math.h>
 #include <stdlib.h>
 #include <string.h>
-#include <sys/mman.h>
-#include <unistd.h>
 
 enum { CELLS_X = 256, CELLS_Y = 128, MOST_DIVISIONS = 6, POLYGON_MAX = 16 };
 
@@ -61,32 +59,19 @@ int stitch_new(struct stitch **out, int width)
     return 0;
 }
 
-// Of data, which is ours alone: the whole pages between the bytes begin and end. They take no memory from here on: a file keeps what was written,
-// other memory is zero again.
-static void leave_pages(void *data, size_t begin, size_t end)
-{
-    const uintptr_t page = (uintptr_t)sysconf(_SC_PAGESIZE), at = (uintptr_t)data;
-    const uintptr_t from = (at + begin + page - 1) / page * page, to = (at + end) / page * page;
-    if (from < to)
-        madvise((void *)from, to - from, MADV_DONTNEED);
-}
-
 void stitch_rest(struct stitch *s, const char *folder)
 {
     const size_t n_bytes = (size_t)s->width * (size_t)s->height * sizeof(*s->texel);
     if (!s->is_in_file && !s->n_stops) {
-        const int fd = open(folder, O_TMPFILE | O_RDWR | O_CLOEXEC, 0600);
-        void *at = fd < 0 || posix_fallocate(fd, 0, (off_t)n_bytes) ? MAP_FAILED : mmap(NULL, n_bytes, PROT_READ | PROT_WRITE, MAP_SHARED, fd, 0);
-        if (fd >= 0)
-            close(fd);
-        if (at != MAP_FAILED) {
+        struct texel *at = resting_new(folder, n_bytes);
+        if (at) {
             free(s->texel);
             s->texel = at;
             s->is_in_file = true;
         }
     }
     if (s->is_in_file)
-        leave_pages(s->texel, 0, n_bytes);
+        resting_leave(s->texel, 0, n_bytes);
 }
 
 void stitch_free(struct stitch *s)
@@ -94,7 +79,7 @@ void stitch_free(struct stitch *s)
     if (!s)
         return;
     if (s->is_in_file)
-        munmap(s->texel, (size_t)s->width * (size_t)s->height * sizeof(*s->texel));
+        resting_free(s->texel, (size_t)s->width * (size_t)s->height * sizeof(*s->texel));
     else
         free(s->texel);
     free(s->touched);
@@ -391,8 +376,6 @@ static int note_touched(struct stitch *s, struct view *v, const struct mosaic *m
 {
     const size_t n = (size_t)s->width * (size_t)s->height;
     const struct merged *m = mo->m;
-    free(s->is_touched);
-    s->is_touched = NULL;
     if (!memchr(m->quality, BRACKET_CLIPPED, (size_t)m->width * (size_t)m->height))
         return 0;
     s->is_touched = calloc(n, 1);
@@ -465,9 +448,9 @@ static int compare_with_before(struct stitch *s, struct stitch_stop_report *r)
 static void leave_rows(const struct merged *m, int y)
 {
     const size_t n = (size_t)(y > 2 ? y - 2 : 0) * (size_t)m->width;
-    leave_pages(m->radiance, 0, n * sizeof(*m->radiance));
-    leave_pages(m->variance, 0, n * sizeof(*m->variance));
-    leave_pages(m->quality, 0, n);
+    resting_leave(m->radiance, 0, n * sizeof(*m->radiance));
+    resting_leave(m->variance, 0, n * sizeof(*m->variance));
+    resting_leave(m->quality, 0, n);
 }
 
 static int add_stop(struct stitch *s, const struct lens *lens, const double R[9], const struct merged *m, bool is_last_use, struct stitch_stop_report *r)
@@ -490,6 +473,8 @@ static int add_stop(struct stitch *s, const struct lens *lens, const double R[9]
     for (int y = 0; !err && y < m->height; y++) {
         if (is_last_use && y % 64 == 0)
             leave_rows(m, y);
+        if (s->is_in_file && y % 512 == 0) // texels that an earlier part of the stop lay on
+            resting_leave(s->texel, 0, (size_t)s->width * (size_t)s->height * sizeof(*s->texel));
         step_row(s, &v, y);
         for (int x = 0; x < m->width; x++) {
             const struct corner *c[4];
@@ -508,6 +493,8 @@ static int add_stop(struct stitch *s, const struct lens *lens, const double R[9]
     if (!err)
         err = compare_with_before(s, r);
     s->n_stops += !err;
+    free(s->is_touched);
+    s->is_touched = NULL;
     free(v.upper);
     free(v.lower);
     return err;
@@ -525,49 +512,54 @@ int stitch_add(struct stitch *s, const struct lens *lens, const double R[9], con
 
 // ---- the whole --------------------------------------------------------------------------------------------------------------------
 
-int stitch_finish(struct image *out, struct stitch *s, const double M[9], struct panorama_report *report)
+const char *const stitch_channels[STITCH_CHANNELS] = { "R", "G", "B", "variance.R", "variance.G", "variance.B", "coverage", "clip" };
+
+static void finish_texel(const struct stitch *s, const double M[9], size_t i, double whole, float to[STITCH_CHANNELS])
 {
-    static const char *const names[] = { "R", "G", "B", "variance.R", "variance.G", "variance.B", "coverage", "clip" };
-    enum { N_CHANNELS = sizeof(names) / sizeof(names[0]) };
-    *out = (struct image){ 0 };
-    const int err = image_new(out, s->width, s->height, N_CHANNELS, names);
-    if (err)
-        return err;
-    for (int y = 0; y < s->height; y++) {
-        const double whole = (s->sine[y] - s->sine[y + 1]) * s->height / 2;
-        for (int x = 0; x < s->width; x++) {
-            const size_t i = (size_t)y * (size_t)s->width + (size_t)x;
-            struct texel t = s->texel[i];
-            // What a stop saw clipped counts unless another saw at least half of the texel unclipped.
-            if (s->touched && t.cover < .5 * whole) {
-                const struct texel *more = s->touched + i;
-                t.cover += more->cover, t.weight += more->weight, t.clip += more->clip;
-                for (int c = 0; c < 3; c++)
-                    t.num[c] += more->num[c], t.var[c] += more->var[c];
-            }
-            if (!(t.cover > 1e-5 * whole))
-                continue;
-            float *to = out->data + i * N_CHANNELS;
-            const double w = (double)t.weight;
-            for (int c = 0; c < 3; c++) {
-                double sum = 0, var = 0;
-                for (int k = 0; k < 3; k++) {
-                    sum += M[3 * c + k] * (double)t.num[k] / w;
-                    var += M[3 * c + k] * M[3 * c + k] * (double)t.var[k] / (w * w);
-                }
-                to[c] = (float)fmax(sum, 0); // noise of the dark, or a colour out of gamut: light is not negative
-                to[3 + c] = (float)var;
-            }
-            to[6] = (float)fmin((double)t.cover / whole, 1);
-            to[7] = (float)fmin((double)t.clip / w, 1);
-        }
-        if (s->is_in_file && y % 64 == 63)
-            leave_pages(s->texel, 0, (size_t)(y + 1) * (size_t)s->width * sizeof(*s->texel));
+    struct texel t = s->texel[i];
+    memset(to, 0, STITCH_CHANNELS * sizeof(*to));
+    // What a stop saw clipped counts unless another saw at least half of the texel unclipped.
+    if (s->touched && t.cover < .5 * whole) {
+        const struct texel *more = s->touched + i;
+        t.cover += more->cover, t.weight += more->weight, t.clip += more->clip;
+        for (int c = 0; c < 3; c++)
+            t.num[c] += more->num[c], t.var[c] += more->var[c];
     }
-    const int examined = panorama_examine(report, out);
-    if (examined)
-        image_free(out);
-    return examined;
+    if (!(t.cover > 1e-5 * whole))
+        return;
+    const double w = (double)t.weight;
+    for (int c = 0; c < 3; c++) {
+        double sum = 0, var = 0;
+        for (int k = 0; k < 3; k++) {
+            sum += M[3 * c + k] * (double)t.num[k] / w;
+            var += M[3 * c + k] * M[3 * c + k] * (double)t.var[k] / (w * w);
+        }
+        to[c] = (float)fmax(sum, 0); // noise of the dark, or a colour out of gamut: light is not negative
+        to[3 + c] = (float)var;
+    }
+    to[6] = (float)fmin((double)t.cover / whole, 1);
+    to[7] = (float)fmin((double)t.clip / w, 1);
+}
+
+static double texel_area(const struct stitch *s, int y)
+{
+    return (s->sine[y] - s->sine[y + 1]) * s->height / 2;
+}
+
+// Of sums that rest: the rows above y.
+static void leave_texels(struct stitch *s, int y)
+{
+    if (s->is_in_file && y % 64 == 0)
+        resting_leave(s->texel, 0, (size_t)y * (size_t)s->width * sizeof(*s->texel));
+}
+
+int stitch_row(void *arg, int y, float *row)
+{
+    const struct stitch_rows *r = arg;
+    leave_texels(r->stitch, y);
+    for (int x = 0; x < r->stitch->width; x++)
+        finish_texel(r->stitch, r->rgb_from_camera, (size_t)y * (size_t)r->stitch->width + (size_t)x, texel_area(r->stitch, y), row + (size_t)x * STITCH_CHANNELS);
+    return 0;
 }
 
 static int compare_lights(const void *a, const void *b)
@@ -589,8 +581,24 @@ static void keep_brightest(struct panorama_report *r, const struct clipped_light
     qsort(r->light, (size_t)r->n_listed, sizeof(r->light[0]), compare_lights);
 }
 
+struct source { // of texels: a picture, or sums
+    int width, height;
+    int clip, coverage, variance; // channels; -1: none
+    const struct image *picture;
+    const struct stitch_rows *rows;
+};
+
+static const float *look_at(const struct source *p, int x, int y, float room[STITCH_CHANNELS])
+{
+    const size_t i = (size_t)y * (size_t)p->width + (size_t)x;
+    if (p->picture)
+        return p->picture->data + i * (size_t)p->picture->n_channels;
+    finish_texel(p->rows->stitch, p->rows->rgb_from_camera, i, texel_area(p->rows->stitch, y), room);
+    return room;
+}
+
 // mark: 1 clipped; becomes 2 when visited. stack: as many as texels are marked.
-static void collect_light(struct panorama_report *r, const struct image *p, uint8_t *mark, int32_t *stack, int32_t seed, int least)
+static void collect_light(struct panorama_report *r, const struct source *p, uint8_t *mark, int32_t *stack, int32_t seed, int least)
 {
     struct clipped_light l = { 0 };
     int n = 0, count = 0;
@@ -601,7 +609,8 @@ static void collect_light(struct panorama_report *r, const struct image *p, uint
         const int x = at % p->width, y = at / p->width;
         const double lon = M_PI - 2 * M_PI * (x + .5) / p->width, lat = M_PI / 2 - M_PI * (y + .5) / p->height;
         const double area = 2 * M_PI / p->width * (cos(M_PI * y / p->height) - cos(M_PI * (y + 1) / p->height));
-        const float *v = p->data + (size_t)at * (size_t)p->n_channels;
+        float room[STITCH_CHANNELS];
+        const float *v = look_at(p, x, y, room);
         const double light = (double)v[0] + (double)v[1] + (double)v[2];
         count++;
         l.solid_angle_sr += area;
@@ -632,41 +641,50 @@ static int compare_floats(const void *a, const void *b)
     return (x > y) - (x < y);
 }
 
-int panorama_examine(struct panorama_report *r, const struct image *p)
+static int examine(struct panorama_report *r, const struct source *p)
 {
-    const int clip = image_channel(p, "clip"), coverage = image_channel(p, "coverage"), variance = image_channel(p, "variance.G");
     const size_t n = (size_t)p->width * (size_t)p->height;
-    float highest = 0, lowest = INFINITY;
+    float highest = 0, lowest = INFINITY, room[STITCH_CHANNELS];
+    int32_t *stack = NULL;
     *r = (struct panorama_report){ 0 };
     uint8_t *mark = calloc(n, 1);
-    int32_t *stack = malloc(n * sizeof(*stack));
-    float *snr = variance >= 0 ? malloc(n * sizeof(*snr)) : NULL;
-    size_t n_snr = 0;
-    int err = mark && stack && (snr || variance < 0) ? 0 : -ENOMEM;
+    float *snr = p->variance >= 0 ? malloc(n * sizeof(*snr)) : NULL;
+    size_t n_snr = 0, n_marked = 0;
+    int err = mark && (snr || p->variance < 0) ? 0 : -ENOMEM;
     if (err)
         goto out;
-    for (size_t i = 0; i < n; i++)
-        for (int c = 0; c < 3; c++) {
-            highest = fmaxf(highest, p->data[i * (size_t)p->n_channels + (size_t)c]);
-            lowest = fminf(lowest, p->data[i * (size_t)p->n_channels + (size_t)c]);
-        }
+    for (int y = 0; y < p->height && p->clip < 0; y++)
+        for (int x = 0; x < p->width; x++)
+            for (int c = 0; c < 3; c++) {
+                const float v = look_at(p, x, y, room)[c];
+                highest = fmaxf(highest, v);
+                lowest = fminf(lowest, v);
+            }
     for (int y = 0; y < p->height; y++) {
         const double area = 2 * M_PI / p->width * (cos(M_PI * y / p->height) - cos(M_PI * (y + 1) / p->height));
+        if (p->rows)
+            leave_texels(p->rows->stitch, y);
         for (int x = 0; x < p->width; x++) {
             const size_t i = (size_t)y * (size_t)p->width + (size_t)x;
-            const float *v = p->data + i * (size_t)p->n_channels;
-            const double covered = coverage >= 0 ? (double)v[coverage] : 1;
+            const float *v = look_at(p, x, y, room);
+            const double covered = p->coverage >= 0 ? (double)v[p->coverage] : 1;
             r->uncovered_sr += area * (1 - covered);
             for (int c = 0; c < 3; c++)
                 r->total[c] += area * (double)v[c];
-            mark[i] = clip >= 0 ? v[clip] > 1e-3f : highest > 2 * lowest && fmaxf(v[0], fmaxf(v[1], v[2])) >= .999f * highest;
-            if (snr && covered > 0 && v[variance] > 0)
-                snr[n_snr++] = v[1] / sqrtf(v[variance]);
+            mark[i] = p->clip >= 0 ? v[p->clip] > 1e-3f : highest > 2 * lowest && fmaxf(v[0], fmaxf(v[1], v[2])) >= .999f * highest;
+            n_marked += mark[i];
+            if (snr && covered > 0 && v[p->variance] > 0)
+                snr[n_snr++] = v[1] / sqrtf(v[p->variance]);
         }
+    }
+    stack = malloc((n_marked + 1) * sizeof(*stack));
+    if (!stack) {
+        err = -ENOMEM;
+        goto out;
     }
     for (size_t i = 0; i < n; i++)
         if (mark[i] == 1)
-            collect_light(r, p, mark, stack, (int32_t)i, clip >= 0 ? 1 : 8);
+            collect_light(r, p, mark, stack, (int32_t)i, p->clip >= 0 ? 1 : 8);
     if (n_snr) {
         qsort(snr, n_snr, sizeof(*snr), compare_floats);
         r->median_snr = (double)snr[n_snr / 2];
@@ -676,5 +694,30 @@ out:
     free(mark);
     free(stack);
     free(snr);
+    return err;
+}
+
+int panorama_examine(struct panorama_report *r, const struct image *p)
+{
+    return examine(r, &(struct source){ .width = p->width, .height = p->height, .picture = p, .clip = image_channel(p, "clip"),
+                                        .coverage = image_channel(p, "coverage"), .variance = image_channel(p, "variance.G") });
+}
+
+int stitch_examine(struct panorama_report *r, const struct stitch_rows *rows)
+{
+    return examine(r, &(struct source){ .width = rows->stitch->width, .height = rows->stitch->height, .rows = rows, .clip = 7, .coverage = 6, .variance = 4 });
+}
+
+int stitch_finish(struct image *out, struct stitch *s, const double M[9], struct panorama_report *report)
+{
+    struct stitch_rows rows = { .stitch = s };
+    memcpy(rows.rgb_from_camera, M, sizeof(rows.rgb_from_camera));
+    int err = image_new(out, s->width, s->height, STITCH_CHANNELS, stitch_channels);
+    for (int y = 0; y < s->height && !err; y++)
+        err = stitch_row(&rows, y, out->data + (size_t)y * (size_t)s->width * STITCH_CHANNELS);
+    if (!err)
+        err = panorama_examine(report, out);
+    if (err)
+        image_free(out);
     return err;
 }

@@ -50,6 +50,15 @@ void stitch_rest(struct stitch *s, const char *folder);
 // rgb_from_camera: row-major, applied at the end. Channels R, G, B, "variance.R" "variance.G" "variance.B" (of the texel's mean, camera
 // noise only: never too small; 15 % too large for texels of 10 pixels, more for smaller ones, because interpolated pixels share sites), "coverage" (1: all of the texel was seen), "clip" (share of the weight that was clipped).
 int stitch_finish(struct image *out, struct stitch *s, const double rgb_from_camera[9], struct panorama_report *report);
+// The same without a picture in memory: its report, and its row y, of STITCH_CHANNELS a texel (for image_write_exr_rows; 0).
+enum { STITCH_CHANNELS = 8 };
+extern const char *const stitch_channels[STITCH_CHANNELS];
+struct stitch_rows {
+    struct stitch *stitch;
+    double rgb_from_camera[9];
+};
+int stitch_examine(struct panorama_report *report, const struct stitch_rows *rows);
+int stitch_row(void *arg, int y, float *row); // arg: struct stitch_rows
 void stitch_free(struct stitch *s); // NULL allowed
 
 // The clipped lights, uncovered directions and sums of a panorama with such channels, or of one without: then a plateau (at least 8 touching

@@ -575,6 +575,24 @@ static void what_the_lens_does_not_see_does_not_count(void **state)
     free(scene);
 }
 
+// A file or a plan may say anything; what cannot be is as if it said nothing. No sum becomes infinite or none.
+static void an_exposure_that_cannot_be_is_none(void **state)
+{
+    (void)state;
+    static const struct { double time_s, f_number, iso; } wrong[] = {
+        { 1e-10, 999, 1e-30 }, { 1e-300, 1, 100 }, { 1e300, 8, 100 }, { INFINITY, 8, 100 }, { NAN, 8, 100 }, { 1, 1e-12, 100 }, { 1, INFINITY, 100 }, { 1, 8, INFINITY },
+    };
+    for (size_t k = 0; k < sizeof(wrong) / sizeof(wrong[0]); k++) {
+        struct raw_frame f = { .exposure_s = wrong[k].time_s, .f_number = wrong[k].f_number, .iso = wrong[k].iso };
+        if (bracket_exposure(&f) != 0)
+            fail_msg("%g s, f/%g, ISO %g: %g", wrong[k].time_s, wrong[k].f_number, wrong[k].iso, bracket_exposure(&f));
+    }
+    struct raw_frame f = { .exposure_s = exp2(-15) * exp2(-20), .f_number = 64, .iso = 50 }; // the shortest, through a filter for the sun
+    assert_true(bracket_exposure(&f) > 0);
+    f = (struct raw_frame){ .exposure_s = 3600, .f_number = .95, .iso = 409600 };
+    assert_true(bracket_exposure(&f) > 0);
+}
+
 int main(void)
 {
     const struct CMUnitTest tests[] = {
@@ -591,6 +609,7 @@ int main(void)
         cmocka_unit_test(a_sensor_that_clips_below_its_white_level_is_found_out),
         cmocka_unit_test(the_planner_stops_when_no_light_clips_and_the_dark_is_seen),
         cmocka_unit_test(what_the_lens_does_not_see_does_not_count),
+        cmocka_unit_test(an_exposure_that_cannot_be_is_none),
     };
     return cmocka_run_group_tests(tests, NULL, NULL);
 }

@@ -405,6 +405,39 @@ static void a_lost_event_is_made_up_for_by_the_listing(void **state)
     }
 }
 
+// Numbered folders are for the camera to count, but a card may come from anywhere.
+static void a_frame_behind_many_folders_is_found_or_the_card_is_refused(void **state)
+{
+    (void)state;
+    static const struct { const char *base, *conf; int n_folders; } cards[] = {
+        { "nikon", "nikon", 600 }, { "generic", "generic", 5000 },
+    };
+    for (size_t k = 0; k < sizeof(cards) / sizeof(cards[0]); k++) {
+        struct sim s;
+        struct worker w;
+        char text[80];
+        const int n = snprintf(text, sizeof(text), "base = %s\nolder_folders = %d\n", cards[k].base, cards[k].n_folders);
+        scratch_write("card", text, (size_t)n);
+        sim_start(&s, scratch_path("card"), "A01 on shot 1 lose_added 1\n");
+        worker_start(&w);
+        done(&w, opening(&s, cards[k].conf));
+        release_shutter(&w);
+        wait_ms(500);
+        const struct camera_command newest = { .kind = CAMERA_LIST, .timeout_ms = 30000 }, all = { .kind = CAMERA_LIST, .n_objects = 8, .timeout_ms = 30000 };
+        if (cards[k].n_folders > 4096) { // a list that is not complete is none
+            fails(&w, newest, CAMERA_CARD);
+            assert_non_null(strstr(w.answer.text, "folders"));
+            fails(&w, all, CAMERA_CARD);
+        } else {
+            assert_int_equal(done(&w, newest)->n_listed, 1);
+            assert_int_equal(done(&w, all)->n_listed, 1);
+        }
+        worker_stop(&w);
+        sim_stop(&s);
+    }
+    scratch_empty();
+}
+
 static void the_wrong_body_is_not_used(void **state)
 {
     (void)state;
@@ -838,6 +871,7 @@ int main(void)
     const struct CMUnitTest tests[] = {
         cmocka_unit_test(a_frame_of_each_kind_comes_from_release_to_disk),
         cmocka_unit_test(a_lost_event_is_made_up_for_by_the_listing),
+        cmocka_unit_test(a_frame_behind_many_folders_is_found_or_the_card_is_refused),
         cmocka_unit_test(the_wrong_body_is_not_used),
         cmocka_unit_test(what_a_body_says_is_text_and_moves_no_cursor),
         cmocka_unit_test(what_a_body_does_not_take_is_told_not_hidden),

@@ -157,6 +157,29 @@ static void the_exposure_is_read_to_the_microsecond_and_to_the_true_shutter(void
     unlink(scratch_path("a.dng"));
 }
 
+// A matrix that makes a colour ten thousand times the others is no camera's: it is not used, which whoever reads the frame is told.
+static void a_matrix_that_cannot_be_is_not_used(void **state)
+{
+    (void)state;
+    struct raw_frame f;
+    char why[200] = "";
+    for (int c = 0; c < 3; c++) {
+        struct raw_dng_info info = raw_info(64, 64);
+        info.wb[0] = info.wb[1] = info.wb[2] = 1;
+        info.wb[c] = 1e4;
+        raw_write(scratch_path("a.dng"), &info, raw_scatter, NULL);
+        assert_int_equal(raw_read(&f, scratch_path("a.dng"), why, sizeof(why)), 0);
+        assert_false(f.has_colour);
+        for (int i = 0; i < 3; i++) {
+            assert_true(f.daylight[i] == 1);
+            for (int k = 0; k < 3; k++)
+                assert_true(f.srgb_from_camera[i][k] == (i == k));
+        }
+        raw_free(&f);
+    }
+    unlink(scratch_path("a.dng"));
+}
+
 // The file's matrix is sRGB's own times wb, also where LibRaw's table has a camera of that name.
 static void colour_is_the_files_own_matrix_and_its_daylight(void **state)
 {
@@ -237,6 +260,7 @@ int main(void)
         cmocka_unit_test(colour_is_the_files_own_matrix_and_its_daylight),
         cmocka_unit_test(a_file_cut_short_is_never_read_as_whole),
         cmocka_unit_test(labels_of_dials_become_powers_of_two),
+        cmocka_unit_test(a_matrix_that_cannot_be_is_not_used),
     };
     return cmocka_run_group_tests(tests, make_frame, drop_frame);
 }

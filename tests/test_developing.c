@@ -775,6 +775,46 @@ static void a_clipped_dark_or_shadowed_card_is_refused_by_name(void **state)
     scratch_empty();
 }
 
+static void a_place_for_a_frame_that_is_not_given_is_said(void **state)
+{
+    (void)state;
+    struct scene *scene;
+    struct image im;
+    assert_int_equal(mkdir(scratch_path("card"), 0777), 0);
+    assert_int_equal(image_new(&im, W, H, 3, NULL), 0);
+    for (int i = 0; i < W * H * 3; i++)
+        im.data[i] = .4f;
+    assert_int_equal(image_write_exr(&im, scratch_path("card/any.exr"), IMAGE_FLOAT, IMAGE_ZIP), 0);
+    image_free(&im);
+    assert_int_equal(scene_open(&scene, scratch_path("card"), W, H, 1, any_name), 0);
+    write_frame("one.dng", scene, "generic", 0, 0, 1. / 128, 8, 100);
+    write_frame("two.dng", scene, "generic", 0, 1, 1. / 128, 8, 100);
+    scratch_write("places.json", "", 0);
+    // A rig's places, of which some bodies are measured: said, and done.
+    assert_int_equal(run(NULL, "for f in one two three; do echo \"{\\\"file\\\": \\\"$f.dng\\\", \\\"patch\\\": [100, 100, 100, 100]},\"; done >$D/all; (echo '{\"places\": ['; sed '$s/,$//' $D/all; echo ']}') >$D/places.json; "
+                               "$BIN/rigctl calibrate colour --places $D/places.json -o $D/colour.json $D/one.dng $D/two.dng 2>$D/said >/dev/null"),
+                     0);
+    assert_int_equal(run(NULL, "grep warning $D/said | grep 'places.json' | grep -q 'three.dng' && test -e $D/colour.json && rm $D/colour.json"), 0);
+    // A name with an error in it, where the frame that was meant would be measured at the place for all.
+    assert_int_equal(run(NULL, "sed -i 's/two.dng/tow.dng/; s/three.dng/one.dng/' $D/places.json; "
+                               "$BIN/rigctl calibrate colour --patch 10,10,50,50 --places $D/places.json -o $D/colour.json $D/one.dng $D/two.dng 2>$D/said >/dev/null"),
+                     1);
+    assert_int_equal(run(NULL, "grep error $D/said | grep 'places.json' | grep -q 'tow.dng' && test ! -e $D/colour.json"), 0);
+    scene_close(scene);
+    assert_int_equal(run(NULL, "rm -r $D/card $D/all"), 0);
+    scratch_empty();
+}
+
+static void without_its_decoder_rigctl_says_so(void **state)
+{
+    (void)state;
+    scratch_write("any.dng", "any", 3);
+    assert_int_equal(run(NULL, "mkdir $D/alone && cp $BIN/rigctl $D/alone && $D/alone/rigctl develop $D/any.dng -o $D/out 2>$D/said"), 1);
+    assert_int_equal(run(NULL, "grep -c . $D/said | grep -qx 1 && grep 'alone/rigd-develop' $D/said | grep -q 'No such file'"), 0);
+    assert_int_equal(run(NULL, "rm -rf $D/alone $D/out"), 0);
+    scratch_empty();
+}
+
 int main(void)
 {
     const struct CMUnitTest tests[] = {
@@ -795,6 +835,8 @@ int main(void)
         cmocka_unit_test(bodies_with_gains_of_their_own_share_one_space_after_calibration),
         cmocka_unit_test(a_chart_seen_by_a_noisy_rig_stays_within_its_bounds),
         cmocka_unit_test(a_clipped_dark_or_shadowed_card_is_refused_by_name),
+        cmocka_unit_test(a_place_for_a_frame_that_is_not_given_is_said),
+        cmocka_unit_test(without_its_decoder_rigctl_says_so),
     };
     log_set_program("test");
     if (scratch_open())

@@ -588,6 +588,13 @@ int body_init(struct body *b, const struct personality *personality, unsigned in
     if (!dcim)
         return -ENOMEM;
     *dcim = (struct body_object){ .handle = HANDLE_DCIM, .format = 0x3001, .name = "DCIM" };
+    for (int i = 0; i < personality->older_folders; i++) {
+        struct body_object *older = new_object(b);
+        if (!older)
+            return -ENOMEM;
+        *older = (struct body_object){ .handle = b->next_handle++, .parent = HANDLE_DCIM, .format = 0x3001 };
+        snprintf(older->name, sizeof(older->name), "%05dOLD", i);
+    }
     struct body_object *folder = new_object(b);
     if (!folder)
         return -ENOMEM;

@@ -32,6 +32,7 @@ static const struct key {
     { "file_prefix", KEY_TEXT, FIELD(file_prefix), 0, 0 },
     { "raw_extension", KEY_TEXT, FIELD(raw_extension), 0, 0 },
     { "folder", KEY_TEXT, FIELD(folder), 0, 0 },
+    { "older_folders", KEY_INT, FIELD(older_folders), 0, 9000 },
     { "raw_format", KEY_U16, FIELD(raw_format), 0, 65535 },
     { "storage", KEY_U32, FIELD(storage), 1, UINT32_MAX },
     { "lag_ms", KEY_NUMBER, FIELD(lag_ms), 0, 10000 },

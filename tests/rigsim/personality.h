@@ -69,6 +69,7 @@ struct personality {
     char file_prefix[8]; // names are file_prefix, 4 digits, extension: "DSC_" -> DSC_0001.DNG
     char raw_extension[5], folder[16];
     uint16_t raw_format; // PTP object format of raws
+    int older_folders;   // beside it on the card, empty, before it in every listing: "00000OLD", "00001OLD", ...
     uint32_t storage;
 
     double lag_ms, lag_spread_ms, lag_jitter_ms; // full-press to exposure: mean, sigma between bodies, sigma between shots
