@@ -12,7 +12,7 @@
 enum { MOST_BORDERS = 1 << 22, MOST_PIECES = 1 << 21, N_BINS = 64, LARGEST_TEXTURE = 4096 }; // that --texture takes
 static const double piece_px = .5, enough_px = 2;
 static const double neighbours_px = 4;  // so many texels apart on the surface, colours are expected to be alike at this size
-static const double most_looks = 2e8;   // pairs of pieces; atlases of splinters are looked at here and there
+static const double most_looks = 5e7;   // pairs of pieces; atlases of splinters are looked at here and there
 static const double worth_a_word = 1e-3; // of the surface
 static const float uv_limit = 16;       // texels_rasterise leaves out what reaches further
 
