@@ -105,7 +105,7 @@ int stage1_alternate(struct stage1 *s, const uint8_t *fit)
     s->w_sim = s->set->w_sim;
     if (s->p.model == REFLECT_LAMBERT) { // data sets 1 and 2: the albedo is known or shared, so there is nothing to alternate
         memcpy(s->base.lights.inverse_distance, first, n_lights * sizeof(double));
-        err = stage1_minimise(s, 60, 1e-6, NULL);
+        err = stage1_minimise(s, 100, 1e-6, NULL); // small studios took 22 to 62
         s->w_sim_sum = s->w_sim * s->n_residuals;
         goto end;
     }

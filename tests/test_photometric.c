@@ -452,7 +452,9 @@ static void measuring_leaves_the_albedo_alone(void **state)
 
 // ---- normal equations --------------------------------------------------------------------------------------------------
 
-static const double difference_step = 1e-5;
+// Small: where a light passes a horizon or a clipped sample its bound within a step, the difference is half a slope. At 1e-5 that
+// happened on 3 of 8 seeds, at 1e-6 on none; the rounding of doubles stays below 1e-9.
+static const double difference_step = 1e-7;
 
 static void moved(const struct studio *s, const struct photometric_state *from, int unknown, double by, struct photometric_state *to)
 {

@@ -6,6 +6,7 @@
 #include "solver/vec3.h"
 
 #include <errno.h>
+#include <math.h>
 #include <setjmp.h>
 #include <stdarg.h>
 #include <stddef.h>
@@ -151,12 +152,12 @@ static void atlas_distortion_stays_low(void **state)
     }
 }
 
-// Charts keep at least 1/128 between each other and from the border: dilate every covered texel by
+// Charts keep at least 1/48 between each other and from the border: dilate every covered texel by
 // just under that and no two charts may meet.
 static void charts_keep_their_distance(void **state)
 {
     (void)state;
-    enum { SIZE = 512, REACH = SIZE / 128 };
+    enum { SIZE = 480, REACH = SIZE / 48 };
     for (int shape = 0; shape < SHAPE_N; shape++) {
         struct mesh mesh;
         struct texels t;
@@ -175,6 +176,57 @@ static void charts_keep_their_distance(void **state)
                 }
             }
         }
+        texels_free(&t);
+        mesh_free(&mesh);
+    }
+}
+
+static float read_bilinearly(const float *image, int size, double u, double v)
+{
+    const double x = u * size - .5, y = (1 - v) * size - .5;
+    const int column = (int)floor(x), row = (int)floor(y);
+    double sum = 0;
+    for (int k = 0; k < 4; k++) {
+        const int i = column + k % 2, j = row + k / 2;
+        assert_true(i >= 0 && j >= 0 && i < size && j < size);
+        sum += (1 - fabs(x - i)) * (1 - fabs(y - j)) * (double)image[j * size + i];
+    }
+    return (float)sum;
+}
+
+// From 128 texels on: every chart in a colour of its own, the gutter filled, read
+// at corners, on edges and inside of all triangles.
+static void what_is_painted_on_a_chart_is_read_back_all_over_it(void **state)
+{
+    (void)state;
+    static const int sizes[] = {128, 192, 256};
+    for (int i = 0; i < SHAPE_N * 3; i++) {
+        enum { STEPS = 4 };
+        const int size = sizes[i / SHAPE_N];
+        struct mesh mesh;
+        struct texels t;
+        float *image = calloc((size_t)size * (size_t)size, sizeof(*image));
+        make(&mesh, (enum shape)(i % SHAPE_N), 5000);
+        assert_non_null(image);
+        assert_int_equal(texels_rasterise(&t, &mesh, size), 0);
+        for (int k = 0; k < t.n; k++)
+            image[t.pixel[k]] = (float)(1 + t.chart[k]);
+        assert_int_equal(texels_fill_gutter(&t, image, 1, 4), 0);
+        for (int k = 0; k < mesh.n_triangles; k++) {
+            for (int a = 0; a <= STEPS; a++) {
+                for (int b = 0; a + b <= STEPS; b++) {
+                    const double w[3] = {(double)a / STEPS, (double)b / STEPS,
+                                         (double)(STEPS - a - b) / STEPS};
+                    double uv[2] = {0, 0};
+                    for (int c = 0; c < 3; c++)
+                        for (int d = 0; d < 2; d++)
+                            uv[d] += w[c] * (double)mesh.uv[mesh.triangle[k][c]][d];
+                    assert_float_equal(read_bilinearly(image, size, uv[0], uv[1]),
+                                       1 + mesh.chart[k], 1e-5);
+                }
+            }
+        }
+        free(image);
         texels_free(&t);
         mesh_free(&mesh);
     }
@@ -273,6 +325,7 @@ int main(void)
         cmocka_unit_test(size_and_place_are_as_asked),
         cmocka_unit_test(atlas_distortion_stays_low),
         cmocka_unit_test(charts_keep_their_distance),
+        cmocka_unit_test(what_is_painted_on_a_chart_is_read_back_all_over_it),
         cmocka_unit_test(a_pebble_never_shadows_itself),
         cmocka_unit_test(knot_and_bowl_do_shadow_themselves),
         cmocka_unit_test(the_same_arguments_give_the_same_bytes),

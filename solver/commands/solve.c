@@ -8,6 +8,7 @@
 #include "solver/commands/solve_materials.h"
 #include "solver/joint.h"
 #include "solver/kernels/kernels.h"
+#include "solver/padding.h"
 #include "solver/parallel.h"
 #include "solver/samples.h"
 #include "solver/take/atomic_file.h"
@@ -183,6 +184,7 @@ static error_t parse_option(int key, char *text, struct argp_state *state)
 struct scene {
     struct lights lights;
     struct samples samples;
+    struct padding padding; // zero where no texture is solved for
     uint8_t *held_out; // [cameras.n]
 };
 
@@ -237,6 +239,13 @@ static int load(struct scene *scene, struct settings *s)
     s->in.needs = TAKE_MESH | TAKE_CAMERAS | TAKE_PANORAMA | TAKE_VIEWS;
     s->in.texture = s->texture;
     int err = inputs_load(&s->in);
+    if (!err && s->joint.albedo == ALBEDO_FREE)
+        err = padding_measure(&scene->padding, &s->in.mesh, &s->in.texels);
+    if (!err && padding_is_short(&scene->padding)) {
+        char text[PADDING_TEXT];
+        padding_text(text, sizeof(text), &scene->padding);
+        log_warning("mesh: %s: %s", s->in.mesh_path, text);
+    }
     if (!err)
         err = choose_held_out(scene, s);
     if (!err)
@@ -359,6 +368,11 @@ static struct json *make_report(const struct scene *scene, const struct settings
             json_append_string(warnings, joint_doubt_text(bit));
     if (m->theta)
         solve_warn_of_materials(warnings, m);
+    if (padding_is_short(&scene->padding)) {
+        char text[PADDING_TEXT];
+        padding_text(text, sizeof(text), &scene->padding);
+        json_append_string(warnings, text);
+    }
     json_set(o, "warnings", warnings);
     json_set_number(stage1, "wall_s", stage_s);
     json_set_int(stage1, "iterations", r->n_jacobians);
