@@ -4,7 +4,7 @@
 # BIN is where the programs lie, BOARDSIM the trigger board's simulation (is it not there, rigsim's wires are the trigger). OUT is replaced.
 # RIG: how many cameras (12; 0: no rig, pictures go straight to the solver). RIG_SCENE: a folder with linear/, geometry/ (cameras of COLMAP as
 # text), panorama.exr, start.json, and perhaps relit/ and truth/: what the cameras see instead of a synthetic studio (all views, or RIG of them).
-# Its unseen.txt, if any, names the views to set aside. RIG_TEXTURE: texels across (192; of a scene 128).
+# Its unseen.txt, if any, names the views to set aside. RIG_TEXTURE: texels across (128).
 set -eu
 out=${1:?usage: demo.sh OUT} bin=${BIN:-build/bin} scene=${RIG_SCENE:-}
 boardsim=${BOARDSIM:-${bin%/bin}/tests/board/boardsim}
@@ -262,8 +262,7 @@ no_rig() {
     "$rigsolve" solve "$studio" -o "$solve" --texture 256 || [ $? -eq 3 ] || fail "the solve failed"
 }
 
-# The synthetic pebble's charts are 1/96 apart: from 192 texels on each has a gutter of its own, and no seam shows.
-texture=${RIG_TEXTURE:-$([ -n "$scene" ] && echo 128 || echo 192)}
+texture=${RIG_TEXTURE:-128}
 if [ "$n_cameras" -gt 0 ]; then use_rig; else no_rig; fi
 
 # ---- how good is it -----------------------------------------------------------------------------------------------------------
