@@ -729,7 +729,7 @@ static void light_that_came_over_the_outline_by_any_way_is_left_out(void **state
         assert_true(got.n > 1000 && fabs(got.edge_offset_px) < .3);
         assert_int_equal(n_mixed, 0);
         if (cases[k].spread_px)
-            assert_true(n_mixed_sharp > 20);
+            assert_true(n_mixed_sharp > 10); // the fault is there, which at 1 px few texels show
         samples_free(&got);
         samples_free(&sharp_got);
         scene_close(&s);
