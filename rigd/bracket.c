@@ -4,6 +4,7 @@
 // compared with what the frames before it predict, block by block, before it is taken in: the ratio of brightness is the test of its
 // exposure, what remains in a block is movement or flicker.
 #include "rigd/bracket.h"
+#include "rigd/plateau.h"
 #include "rigd/resting.h"
 
 #include <errno.h>
@@ -28,6 +29,7 @@ struct bracket {
     int bloom_px;
     int n_taken, blocks_x, blocks_y;
     double saturation;   // lowest plateau so far, else the file's
+    int reached;         // plateau.h: the most of the frames so far
     double longest;      // exposure
     double *taken;       // [n_taken] exposures
     float *num, *den;    // sum u y, sum u h; den < 0: the same of poor frames, as there was no good one; den 0: clipped in all, num is the highest lower bound
@@ -422,11 +424,15 @@ int bracket_add(struct bracket *b, const struct raw_frame *f, const struct raw_f
     if (!taken)
         return -ENOMEM;
     b->taken = taken;
-    r->plateau_dn = bracket_plateau(f);
-    if (r->plateau_dn < 0)
-        return r->plateau_dn;
-    if (r->plateau_dn && r->plateau_dn < b->saturation)
-        b->saturation = r->plateau_dn;
+    struct plateau plateau;
+    const int err_plateau = plateau_find(&plateau, f);
+    if (err_plateau)
+        return err_plateau;
+    if (plateau.dn && b->reached <= plateau.top) {
+        r->plateau_dn = plateau.dn;
+        b->saturation = fmin(b->saturation, plateau.dn);
+    }
+    b->reached = plateau.reached > b->reached ? plateau.reached : b->reached;
     rows.is_dry = is_dry(rows, h);
     for (int i = 0; i < b->n_taken; i++)
         r->is_repeat = r->is_repeat || fabs(h / b->taken[i] - 1) < .01;

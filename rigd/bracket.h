@@ -35,9 +35,8 @@ struct bracket_statistics { // of one frame; [3]: red, green, blue
     int64_t n_over[3];  // above `usable` of saturation, with a neighbour above half of it: hot sites alone are no light
     double brightest[3]; // highest y of those with such a neighbour
     double first_percentile[3], median[3]; // of y
-    int plateau_dn;     // DN at which the sensor really clips where that is below the file's word for it; else 0
+    int plateau_dn;     // plateau_find()
 };
-int bracket_plateau(const struct raw_frame *f);
 // lens: sites that it does not see (outside its circle) do not count; NULL: all count. 0 or -ENOMEM.
 int bracket_measure(struct bracket_statistics *out, const struct raw_frame *f, const struct lens *lens);
 

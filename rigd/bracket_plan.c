@@ -3,6 +3,7 @@
 // The dark end is judged by a percentile and the bright end by the single brightest light, because a lamp may be a dozen photosites of
 // millions; only sites that are bright alone, without any neighbour, are taken for hot ones.
 #include "rigd/bracket.h"
+#include "rigd/plateau.h"
 
 #include <errno.h>
 #include <math.h>
@@ -12,37 +13,6 @@
 
 static const double usable = .9;
 enum { DN_COUNT = 65536, BLACK_SHIFT = 4096 }; // histogram[3] is of DN - black + BLACK_SHIFT
-
-static int64_t sum(const uint32_t *h, int from, int to)
-{
-    int64_t n = 0;
-    for (int i = from < 0 ? 0 : from; i < to && i < DN_COUNT; i++)
-        n += h[i];
-    return n;
-}
-
-// Clipping piles up sites at one DN; light that merely ends there thins out.
-static int plateau_of(const uint32_t *h, double saturation)
-{
-    int top = DN_COUNT - 1;
-    for (; top > 0 && !h[top]; top--)
-        ;
-    const int64_t at_top = sum(h, top - 1, top + 1), below = sum(h, top - 65, top - 1);
-    return top < saturation && top > .5 * saturation && at_top >= 32 && at_top > 8 * below / 32 ? top : 0;
-}
-
-int bracket_plateau(const struct raw_frame *f)
-{
-    uint32_t *h = calloc(DN_COUNT, sizeof(*h));
-    if (!h)
-        return -ENOMEM;
-    const size_t n = (size_t)f->width * (size_t)f->height;
-    for (size_t i = 0; i < n; i++)
-        h[f->site[i]]++;
-    const int found = plateau_of(h, f->saturation);
-    free(h);
-    return found;
-}
 
 static double signal_of(const struct raw_frame *f, int x, int y)
 {
@@ -77,11 +47,12 @@ int bracket_measure(struct bracket_statistics *out, const struct raw_frame *f, c
     memset(out, 0, sizeof(*out));
     if (!h)
         return -ENOMEM;
-    s.plateau_dn = bracket_plateau(f);
-    if (s.plateau_dn < 0) {
+    struct plateau plateau;
+    if (plateau_find(&plateau, f)) {
         free(h);
-        return s.plateau_dn;
+        return -ENOMEM;
     }
+    s.plateau_dn = plateau.dn;
     const double saturation = s.plateau_dn ? s.plateau_dn : f->saturation;
     const double reach = lens ? lens_reach_px(lens) : INFINITY;
     for (int y = 0; y < f->height; y++)

@@ -8,6 +8,7 @@
 #include "rigd/develop_options.h"
 #include "rigd/digest.h"
 #include "rigd/linear.h"
+#include "rigd/plateau.h"
 #include "solver/take/image.h"
 #include "solver/take/json.h"
 #include "solver/take/log.h"
@@ -62,7 +63,7 @@ static const struct argp_option options[] = {
     { "colour", OPTION_COLOUR, "FILE", 0, "Gains and scale of this body, as `rigctl calibrate colour' writes them", 0 },
     { "reference-exposure", OPTION_REFERENCE, "T,N,ISO", 0, "Radiance 1 is what brings the green photosites to the white level at this exposure (default 1/128,8,100)", 0 },
     { "exposure", OPTION_EXPOSURE, "T,N,ISO", 0, "What the exposure was, in place of what the file says; 0 leaves a value to the file", 0 },
-    { "saturation", OPTION_SATURATION, "DN", 0, "Photosites from this value on are clipped (default: the white level)", 0 },
+    { "saturation", OPTION_SATURATION, "DN", 0, "Photosites from this value on are clipped (default: the white level, or where they pile up below it)", 0 },
     { "if-changed", OPTION_IF_CHANGED, NULL, 0, "Do nothing if OUT is whole and was made from this raw in this way", 0 },
     { "patch", OPTION_PATCH, "X,Y,W,H", 0, "No OUT: measure a grey card there, in photosites from the upper left of the sensor", 0 },
     { "chart", OPTION_CHART, "X1,Y1,..,X4,Y4", 0, "No OUT: measure a ColorChecker whose corners (dark skin's, bluish green's, black's, white's) lie there", 0 },
@@ -141,13 +142,13 @@ static error_t parse_option(int key, char *text, struct argp_state *state)
 
 struct job {
     struct arguments a;
-    struct json *result, *warnings, *seconds;
+    struct json *result, *warnings, *notes, *seconds;
     struct raw_frame frame;
     struct saturation saturation;
     struct raw_rgb rgb;
     struct flat *flat;
     const char *flat_path;
-    double scale, gain[3];
+    double scale, gain[3], saturation_dn; // from that DN on sites are marked
     struct exposure exposure;
     char raw_xxh128[DIGEST_HEX], made[MADE_BYTES], tiff_path[4096], date[24], subseconds[12];
     bool doubtful;
@@ -164,6 +165,18 @@ static __attribute__((format(printf, 2, 3))) void doubt(struct job *j, const cha
     log_warning("develop: %s: %s", j->a.raw, text);
     json_append_string(j->warnings, text);
     j->doubtful = true;
+}
+
+// What was found and taken into account.
+static __attribute__((format(printf, 2, 3))) void note(struct job *j, const char *format, ...)
+{
+    char text[500];
+    va_list args;
+    va_start(args, format);
+    vsnprintf(text, sizeof(text), format, args);
+    va_end(args);
+    log_info("develop: %s: %s", j->a.raw, text);
+    json_append_string(j->notes, text);
 }
 
 static __attribute__((format(printf, 3, 4))) int fail(struct job *j, int err, const char *format, ...)
@@ -303,7 +316,10 @@ static int read_flat(struct job *j)
         return fail(j, -ENOMEM, "out of memory");
     int err = raw_read(&frame, j->flat_path, why, sizeof(why));
     if (!err) {
-        err = saturation_of(&saturation, &frame, frame.saturation);
+        struct plateau plateau;
+        err = plateau_find(&plateau, &frame);
+        if (!err)
+            err = saturation_of(&saturation, &frame, plateau.dn ? plateau.dn : frame.saturation);
         if (!err)
             err = flat_from_frame(j->flat, &frame, &saturation, why, sizeof(why));
     } else if (err == -ENOTSUP) {
@@ -350,7 +366,7 @@ static int say_what_is_made(struct job *j)
     err = j->flat_path ? hash_of(j->flat_path, flat_xxh128) : 0;
     if (err)
         return fail(j, err, "flat field %s: %s", j->flat_path, strerror(-err));
-    snprintf(j->made, sizeof(j->made), "rigd-develop " STUDIORIG_VERSION " 2 LibRaw %s raw %s %s%s scale %.9g reference %.9g,%.9g,%.9g gain %.9g,%.9g,%.9g flat %s saturation %g",
+    snprintf(j->made, sizeof(j->made), "rigd-develop " STUDIORIG_VERSION " 3 LibRaw %s raw %s %s%s scale %.9g reference %.9g,%.9g,%.9g gain %.9g,%.9g,%.9g flat %s saturation %g",
              raw_library(), j->raw_xxh128, demosaic_names[a->demosaic], a->tiff ? " tiff" : "", j->scale, a->reference.time_s, a->reference.f_number, a->reference.iso, j->gain[0],
              j->gain[1], j->gain[2], flat_xxh128, a->saturation);
     json_set_string(j->result, "xxh128", j->raw_xxh128);
@@ -412,13 +428,16 @@ static int read_sites(struct job *j)
     int err = raw_read(&j->frame, j->a.raw, why, sizeof(why));
     if (err)
         return fail(j, err, "%s", why);
-    const double level = j->a.saturation ? j->a.saturation : j->frame.saturation;
-    err = saturation_of(&j->saturation, &j->frame, level);
+    struct plateau plateau = { 0 };
+    if (!j->a.saturation)
+        err = plateau_find(&plateau, &j->frame);
+    if (plateau.dn)
+        note(j, "photosites pile up from %d on, below the white level of %g: its sensor saturates there, and they are marked as clipped", plateau.dn, j->frame.white);
+    j->saturation_dn = j->a.saturation ? j->a.saturation : plateau.dn ? plateau.dn : j->frame.saturation;
+    if (!err)
+        err = saturation_of(&j->saturation, &j->frame, j->saturation_dn);
     if (err)
         return fail(j, err, "out of memory");
-    const int pile = j->a.saturation ? 0 : saturation_pile(&j->frame);
-    if (pile)
-        doubt(j, "photosites pile up at %d, below the white level of %g, and none lies above: its sensor saturates there; --saturation %d marks them", pile, j->frame.white, pile);
     if (!j->frame.has_colour)
         doubt(j, "LibRaw knows no colour matrix of a %s %s: the colours are the camera's own", j->frame.make, j->frame.model);
     json_set_number(j->result, "clipped_share", (double)j->saturation.n / j->frame.width / j->frame.height);
@@ -443,7 +462,7 @@ static char *note_of(const struct job *j)
     json_set_numbers(o, "reference_exposure", (const double[3]){ j->a.reference.time_s, j->a.reference.f_number, j->a.reference.iso }, 3);
     json_set_numbers(o, "exposure", (const double[3]){ j->exposure.time_s, j->exposure.f_number, j->exposure.iso }, 3);
     json_set_number(o, "white", f->white);
-    json_set_number(o, "saturation", j->a.saturation ? j->a.saturation : f->saturation);
+    json_set_number(o, "saturation", j->saturation_dn);
     json_set_numbers(o, "black", (const double[4]){ f->black[0][0], f->black[0][1], f->black[1][0], f->black[1][1] }, 4);
     json_set_numbers(o, "daylight", f->daylight, 3);
     set_matrix(o, f);
@@ -608,6 +627,7 @@ int main(int argc, char **argv)
     const struct timespec began = j.began;
     j.result = json_new_object();
     j.warnings = json_new_array();
+    j.notes = json_new_array();
     j.seconds = json_new_object();
     json_set_string(j.result, "file", j.a.raw);
     if (j.a.out) {
@@ -621,6 +641,7 @@ int main(int argc, char **argv)
     json_set_bool(j.result, "ok", !err);
     json_set_bool(j.result, "trusted", !err && !j.doubtful);
     json_set(j.result, "warnings", j.warnings);
+    json_set(j.result, "notes", j.notes);
     json_set(j.result, "seconds", j.seconds);
     say_resources(j.result);
     char *text = json_text(j.result);

@@ -53,27 +53,6 @@ static bool is_saturated(const struct saturation *s, int x, int y)
     return x >= 0 && y >= 0 && x < s->width && y < s->height && (s->bits[(size_t)y * words_per_row(s->width) + (size_t)x / 64] >> x % 64 & 1);
 }
 
-int saturation_pile(const struct raw_frame *f)
-{
-    enum { BELOW = 64, LEAST_SITES = 100, TIMES_AS_MANY = 20 };
-    uint32_t *count = calloc(65536, sizeof(*count));
-    int most = 65535;
-    if (!count)
-        return 0;
-    const size_t n = (size_t)f->width * (size_t)f->height;
-    for (size_t i = 0; i < n; i++)
-        count[f->site[i]]++;
-    while (most > BELOW && !count[most])
-        most--;
-    double below = 0;
-    for (int v = most - BELOW; v < most; v++)
-        below += (double)count[v] / BELOW;
-    const bool high = most < f->saturation && most > f->black[0][0] + .7 * (f->white - f->black[0][0]);
-    const bool piled = high && count[most] >= LEAST_SITES && count[most] >= TIMES_AS_MANY * below;
-    free(count);
-    return piled ? most : 0;
-}
-
 // ---- flat field --------------------------------------------------------------------------------------------------------------
 
 // Means become gains, relative to the middle tenth.

@@ -21,10 +21,6 @@ struct saturation {
 int saturation_of(struct saturation *out, const struct raw_frame *f, double level);
 void saturation_free(struct saturation *s); // NULL and zeroed allowed
 
-// The DN at which sites pile up below the white level and above which there is none: a sensor that saturates below what its file says.
-// 0: no such.
-int saturation_pile(const struct raw_frame *f);
-
 // ---- vignetting and flat field ----
 enum { FLAT_COLUMNS = 64, FLAT_ROWS = 48 };
 struct flat {

@@ -20,6 +20,7 @@ struct sim_camera {
     struct lens lens;
     double yaw_deg, pitch_deg, roll_deg;
     double black, white, clip; // DN; clip: where it really clips (0: white)
+    double clip_spread;        // DN; standard deviation of that over the sites: wells that are full before the converter ends
     double electrons_at_white, read_noise_e; // at ISO 100
     double response[3];        // of R, G, B to radiance 1: raw signal y = response x radiance x h
     double f_number;
@@ -111,7 +112,8 @@ static inline void sim_expose_rows(void *arg, int64_t begin, int64_t end, int wo
             const size_t i = (size_t)y * (size_t)c->lens.width_px + (size_t)x;
             const double e = sim_electrons((double)s->seen[i] * s->h / at_iso * c->electrons_at_white, c->seed, s->shot, i) +
                              c->read_noise_e * random_normal(c->seed, 2 * s->shot + 1, i);
-            s->frame->site[i] = (uint16_t)fmin(fmax(floor(c->black + dn * e + .5), 0), clip);
+            const double full = c->clip_spread > 0 ? clip + c->clip_spread * random_normal(c->seed, UINT64_MAX, i) : clip;
+            s->frame->site[i] = (uint16_t)fmin(fmax(floor(fmin(c->black + dn * e, full) + .5), 0), c->white);
         }
 }
 

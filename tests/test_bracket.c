@@ -481,15 +481,44 @@ static void a_sensor_that_clips_below_its_white_level_is_found_out(void **state)
             assert_int_equal(m.quality[x], BRACKET_CLIPPED);
     merged_free(&m);
     free(f.site);
-    // Light that merely ends is no plateau, nor is a frame without any.
     free(scene);
-    scene = levels(.1, .7);
-    assert_int_equal(sim_expose(&f, scene, &c, 1, 1, 0), 0);
-    assert_int_equal(bracket_plateau(&f), 0);
-    free(f.site);
-    assert_int_equal(sim_expose(&f, scene, &c, 1e-6, 1, 0), 0);
-    assert_int_equal(bracket_plateau(&f), 0);
-    free(f.site);
+}
+
+static void wells_that_are_full_before_white_are_found_out(void **state)
+{
+    (void)state;
+    struct sim_camera c = camera_of(4);
+    c.clip = 15600, c.clip_spread = 35; // above .9, below .98 of white: passed for light once
+    float *scene = levels(.02, 30);
+    const struct bracket_options options = options_of(&c);
+    for (int with_shorter = 0; with_shorter < 2; with_shorter++) {
+        struct raw_frame f[2];
+        struct bracket *b;
+        struct bracket_frame_report r;
+        struct merged m;
+        int64_t n_clipped, n_defects;
+        assert_int_equal(sim_expose(&f[0], scene, &c, 1, 1, 0), 0);
+        assert_int_equal(sim_expose(&f[1], scene, &c, 1. / 64, 1, 1), 0);
+        assert_int_equal(bracket_new(&b, &f[0], &options), 0);
+        assert_int_equal(bracket_add(b, &f[0], with_shorter ? &f[1] : NULL, &r), 0);
+        assert_true(r.plateau_dn > 15600 - 6 * 35 && r.plateau_dn < 15600);
+        if (with_shorter)
+            assert_int_equal(bracket_add(b, &f[1], NULL, &r), 0);
+        assert_int_equal(bracket_finish(&m, b, &n_clipped, &n_defects), 0);
+        double sum = 0, expected = 0;
+        for (int i = 0; i < W * H; i++) {
+            const double light = (double)scene[i];
+            if (light < 1.1)
+                continue;
+            assert_int_equal(m.quality[i] == BRACKET_CLIPPED, !with_shorter);
+            sum += (double)m.radiance[i], expected += light;
+        }
+        if (with_shorter)
+            assert_true(fabs(sum / expected - 1) < .005);
+        merged_free(&m);
+        free(f[0].site);
+        free(f[1].site);
+    }
     free(scene);
 }
 
@@ -607,6 +636,7 @@ int main(void)
         cmocka_unit_test(flicker_shows_as_gain_and_movement_as_a_patch),
         cmocka_unit_test(the_sensor_is_measured_from_two_frames),
         cmocka_unit_test(a_sensor_that_clips_below_its_white_level_is_found_out),
+        cmocka_unit_test(wells_that_are_full_before_white_are_found_out),
         cmocka_unit_test(the_planner_stops_when_no_light_clips_and_the_dark_is_seen),
         cmocka_unit_test(what_the_lens_does_not_see_does_not_count),
         cmocka_unit_test(an_exposure_that_cannot_be_is_none),

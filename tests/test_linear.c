@@ -1,6 +1,5 @@
-// tests/test_linear.c - photosites become radiance: demosaicing, clip masks, flat fields, sensors that saturate early.
+// tests/test_linear.c - photosites become radiance: demosaicing, clip masks, flat fields.
 #include "rigd/linear.h"
-#include "solver/random.h"
 #include "tests/scratch.h"
 
 #include <errno.h>
@@ -32,12 +31,6 @@ static struct raw_frame make_frame(int width, int height, int order, double (*va
 static double plane(int x, int y, int c) // linear in x and y: what bilinear interpolation must keep
 {
     return .1 + .002 * x + .003 * y + .05 * c;
-}
-
-static double scatter(int x, int y, int c)
-{
-    (void)c;
-    return random_uniform(1, 2, (uint64_t)(y * 1000 + x));
 }
 
 static const double ones[3] = { 1, 1, 1 };
@@ -203,20 +196,6 @@ static void a_flat_field_takes_vignetting_off(void **state)
     free(second);
 }
 
-static void a_sensor_that_saturates_early_is_noticed(void **state)
-{
-    (void)state;
-    struct raw_frame f = make_frame(200, 200, 0, scatter);
-    assert_int_equal(saturation_pile(&f), 0);
-    for (int i = 0; i < 200 * 200; i++)
-        if (f.site[i] > 13000)
-            f.site[i] = 13000;
-    assert_int_equal(saturation_pile(&f), 13000);
-    f.saturation = 13000; // as it is told
-    assert_int_equal(saturation_pile(&f), 0);
-    raw_free(&f);
-}
-
 static void gains_and_matrix_act_in_that_order(void **state)
 {
     (void)state;
@@ -257,7 +236,6 @@ int main(void)
         cmocka_unit_test(noise_below_black_is_kept),
         cmocka_unit_test(the_mask_marks_exactly_what_a_saturated_site_took_part_in),
         cmocka_unit_test(a_flat_field_takes_vignetting_off),
-        cmocka_unit_test(a_sensor_that_saturates_early_is_noticed),
         cmocka_unit_test(gains_and_matrix_act_in_that_order),
     };
     return cmocka_run_group_tests(tests, NULL, NULL);
