@@ -16,8 +16,10 @@ for d in $sets; do
     take=$out/$d$tag-$seed solve=$out/$d$tag-$seed.solve code=0
     # shellcheck disable=SC2086 # options are words
     [ -d "$take" ] || "$rigsolve" synth "$d" -o "$take" --seed "$seed" $synth_options >/dev/null
+    bounces=0 # as it was rendered
+    [ "$d" = D4 ] && bounces=1
     # shellcheck disable=SC2086
-    "$rigsolve" solve "$take" -o "$solve" --stage 2 --seed "$seed" $solve_options >"$take.log" || code=$?
+    "$rigsolve" solve "$take" -o "$solve" --stage 2 --seed "$seed" --bounces $bounces $solve_options >"$take.log" || code=$?
     case $code in 0) verdict=trusted ;; 3) verdict='not to be trusted' ;; *) refuse "$d: the solve ended with $code: see $take.log" ;; esac
     rm -rf "$solve/relit"
     "$rigsolve" render "$solve" --cameras "$take/relit/cameras" --lights "$take/relit/lights.json" --samples 1 -o "$solve/relit" >/dev/null
